@@ -1,0 +1,72 @@
+"""Flags of single rows and reason codes of whole examinations: the only vocabulary for "something is wrong here".
+
+A flag tells about one image point or one marker, a reason about one examination. Both are written joined by ``;``.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import Final
+
+
+class MarkerFlag(IntFlag):
+    """What to know of one marker image or one reconstructed marker."""
+
+    NONE = 0
+    OVERLAP = 1  # fitted jointly with a neighbour that it overlaps
+    EDGE = 2  # its image reaches over the edge of the film
+    SATURATED = 4  # saturated pixels under it were masked
+    CLIPPED = 8  # so much was masked that the coordinates lean on little
+    POOR_FIT = 16  # the model does not describe the film here within its noise
+    REJECTED = 32  # left out by a gross-error rule
+    LARGE_RESIDUAL = 64  # residual beyond its statistics
+    AMBIGUOUS = 128  # another identity explains it nearly as well
+    ONE_VIEW = 256  # seen from one focus only
+    PREDICTED = 512  # coordinates come from the known segment, not from rays
+    NO_COVARIANCE = 1024  # the input gave no covariance
+    FOREIGN_MARK = 2048  # a cage mark that this focus is not meant to see; explained, not used
+
+
+def flag_names(value: int) -> str:
+    """Return the names of the flags that are set, joined by ``;`` (empty for none).
+
+    Parameters
+    ----------
+    value : int
+        Flags, as of :class:`MarkerFlag`.
+
+    Returns
+    -------
+    str
+        For example ``"overlap;edge"``.
+    """
+    return ";".join(flag.name.lower().replace("_", "-") for flag in MarkerFlag if flag & value and flag.name)
+
+
+REASONS: Final[dict[str, str]] = {
+    "film-unreadable": "a film of the examination cannot be read; the message says why",
+    "film-format": "a file is no single grey radiograph of 8 to 16 bits; export it again as such",
+    "pitch-missing": "no plausible pixel pitch in the file; set pixel_pitch_mm in study.toml or --pixel-pitch-mm",
+    "film-missing": "a focus has no film; look for a missing or misnamed file",
+    "film-unexpected": "more films than foci, or a shared film beside single ones; look at the file names",
+    "no-markers": "no marker image was found on a film; look at the film, its polarity and response",
+    "cage-not-found": "the marks of the cage are not on the film; look whether it is this cage and this orientation",
+    "cage-ambiguous": "two ways of naming the cage marks explain the film nearly as well; set orientation, or look at the overlay",
+    "few-fiducials": "four fiducial marks were found: no redundancy, a gross error would not show",
+    "few-controls": "two control points were found: little redundancy, a gross error would not show",
+    "fiducial-residual": "fiducial marks do not fit within the limit: another cage build, a bent film, or a wrong mark",
+    "control-residual": "the lines through the control points miss the focus by more than the limit",
+    "focus-far": "the focus lies more than 150 mm from the nominal one; check the set-up in [foci]",
+    "film-bend": "the mean y-parallax differs from zero: the film or cassette was not flat",
+    "pair-ambiguous": "another pairing of the object markers explains the rays nearly as well",
+    "crossing-large": "rays of a marker miss each other by more than their statistics allow",
+    "marker-one-view": "markers were seen from one focus only and have no coordinates",
+    "marker-mismatch": "the markers found are not those of segments.csv",
+    "constellation-ambiguous": "the markers fit segments.csv in more than one way",
+    "no-object-markers": "the cage was found but no object marker",
+    "response-unsure": "the film response could not be told from the film; set response in study.toml",
+    "geometry": "the points do not determine the focus or the plane",
+    "internal": "an unexpected failure; please report it with run.json",
+    "timeout": "the examination took longer than the time limit",
+}
+"""Every reason code of ``exams.csv`` and what to do about it (``docs/errors.md`` is checked against this)."""

@@ -1,0 +1,114 @@
+"""Settings of a study: one frozen model with units in the names, which refuses unknown keys and defines every default once."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rsa_vision.errors import SettingsError
+
+Response = Literal["auto", "density", "transmission", "linear", "log"]
+Orientation = Literal["upright", "any", "mirrored"]
+FilmMode = Literal["shared", "separate"]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+
+
+class Frozen(BaseModel):
+    """Base of all settings: frozen, no unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Limits(Frozen):
+    """Limits of verdicts and gross-error rules, with the defaults of the guideline and of Selvik."""
+
+    fiducial_um: Annotated[float, Field(gt=0)] = 250.0  # selvik.md 2, step 1
+    line_mm: Annotated[float, Field(gt=0)] = 2.0  # selvik.md 2, step 2 (8 x 250 um)
+    focus_mm: Annotated[float, Field(gt=0)] = 150.0  # how far a focus may be from nominal
+    crossing_sigma: Annotated[float, Field(gt=0)] = 5.0  # crossing line error in units of its own sigma
+    parallax_um: Annotated[float, Field(gt=0)] = 100.0  # mean y-parallax that shows film bending (selvik.md 2, table 5)
+    posterior: Annotated[float, Field(gt=0.5, lt=1)] = 0.999  # an identity below it is ambiguous
+    e_rb_mm: Annotated[float, Field(gt=0)] = 0.35  # ISO 16087
+    condition_number: Annotated[float, Field(gt=0)] = 120.0  # guideline
+    false_detections_per_film: Annotated[float, Field(gt=0)] = 0.1  # expected false marker images on a film
+
+
+class Motion(Frozen):
+    """Settings of the motion analysis."""
+
+    reference: str | None = None
+    side: Literal["left", "right"] = "right"
+
+
+class Study(Frozen):
+    """The content of ``study.toml`` (interfaces.md)."""
+
+    cage: str | None = None
+    film: FilmMode | None = None
+    response: Response = "auto"
+    pixel_pitch_mm: Annotated[float, Field(gt=0)] | None = None
+    orientation: Orientation = "upright"
+    temperature_c: Finite | None = None
+    file_pattern: str | None = None
+    object_diameter_mm: Annotated[float, Field(gt=0, lt=10)] | None = None
+    foci: dict[int, Vector] = {}
+    calibration: dict[int, Path] = {}
+    motion: Motion = Motion()
+    limits: Limits = Limits()
+
+    @model_validator(mode="after")
+    def _one_frame(self) -> Self:
+        if self.calibration and self.cage:
+            raise ValueError("cage and calibration exclude each other: rays come from a cage or from calibrated cameras")
+        return self
+
+
+def describe_validation(error: ValidationError) -> str:
+    """Return every error of a pydantic validation on a line of its own, with its path.
+
+    Parameters
+    ----------
+    error : pydantic.ValidationError
+
+    Returns
+    -------
+    str
+        Lines ``path: message``.
+    """
+    return "\n".join(f"  {'.'.join(map(str, item['loc'])) or '(whole file)'}: {item['msg']}" for item in error.errors())
+
+
+def load_study(path: Path) -> Study:
+    """Read a study file.
+
+    Parameters
+    ----------
+    path : Path
+        A TOML file as in ``interfaces.md``; paths in it are taken relative to it.
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read, is no TOML, or has unknown keys or wrong values (all are listed).
+    """
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SettingsError(f"{path}: not a readable TOML file ({error})") from error
+    try:
+        study = Study.model_validate(raw)
+    except ValidationError as error:
+        raise SettingsError(f"{path}: wrong settings\n{describe_validation(error)}") from error
+    calibration = {focus: (path.parent / file).resolve() for focus, file in study.calibration.items()}
+    cage = study.cage
+    if cage is not None and cage.endswith(".toml"):
+        cage = str((path.parent / cage).resolve())
+    return study.model_copy(update={"calibration": calibration, "cage": cage})
