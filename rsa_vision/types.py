@@ -1,7 +1,7 @@
 """The data that flows through rsa_vision, one frozen type for every arrow: film -> marker images -> named points -> rays -> 3-D markers.
 
-Tables are structures of arrays; row ``i`` of every array belongs together. Pixel coordinates are ``(col, row)`` with (0, 0) at the centre of
-the first stored pixel; laboratory coordinates are mm in the cage's frame. Covariances belong to the coordinates beside them.
+Tables are structures of arrays; row ``i`` of every array belongs together. Pixel coordinates are ``(col, row)`` with (0, 0) at the centre
+of the first stored pixel; laboratory coordinates are mm in the cage's frame. Covariances belong to the coordinates beside them.
 """
 
 from __future__ import annotations
@@ -148,6 +148,16 @@ class FocusSolution:
         Root mean square and maximum of the line-to-focus distances.
     n_fiducials, n_controls : int
         Marks used, after the gross-error rules.
+    fiducial_birge, control_birge : float
+        Factors (1 or more) by which the standard deviations of this film's images, and on top of them of the parameters of the focus, were
+        multiplied because the residuals are larger than the stated covariances predict.
+    image_sd_px : float
+        Standard deviation of an image coordinate by the residuals, which stands in where no covariance was given; else NaN.
+    parameter_covariance : ndarray of shape (11, 11)
+        Joint covariance of the first eight elements of ``plane_from_film``, row by row, and of the position, by errors of the images.
+    cage_effect : ndarray of shape (11, m)
+        Change of these parameters for one standard deviation of each coordinate of the cage's marks, the same marks in the same columns
+        for all foci; m = 0 for a cage without standard deviations. ``covariance_mm2`` holds both parts.
     """
 
     focus: int
@@ -160,6 +170,11 @@ class FocusSolution:
     line_max_um: float
     n_fiducials: int
     n_controls: int
+    fiducial_birge: float
+    control_birge: float
+    image_sd_px: float
+    parameter_covariance: Float
+    cage_effect: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,7 +221,7 @@ class Reconstruction:
     residual_um : ndarray of shape (n,)
         Fiducial: radial error. Control: line-to-focus distance. Object: distance from its ray to the reconstructed point. Else NaN.
     used : ndarray of bool, shape (n,)
-        False where a gross-error rule left the point out, or it has no role.
+        False where a gross-error rule left the point out, or nothing was computed from it.
     foci : tuple of FocusSolution
     markers : Markers
     controls : Markers

@@ -1,0 +1,322 @@
+"""Steps 1 and 2 of X-RAY for one focus, and its rays, both with their errors (selvik.md 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsa_vision.cages import Cage
+from rsa_vision.errors import GeometryError
+from rsa_vision.flags import MarkerFlag
+from rsa_vision.geometry.covariance import (
+    ROUNDING,
+    HomographyErrors,
+    ResectionErrors,
+    birge_factor,
+    blocks,
+    homography_errors,
+    resection_errors,
+)
+from rsa_vision.geometry.gross_errors import drop_gross_errors
+from rsa_vision.geometry.homography import apply_homography, fit_homography, homography_jacobians
+from rsa_vision.geometry.rays import RayBundle
+from rsa_vision.geometry.resection import locate_focus
+from rsa_vision.settings import Limits
+from rsa_vision.types import Bool, Float, FocusSolution, ImagePoints, Int
+
+UM_PER_MM = 1000.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FocusFit:
+    """Steps 1 and 2 with what they say of every point.
+
+    Attributes
+    ----------
+    solution : FocusSolution
+    plane_mm : ndarray of shape (n, 3)
+        Every point in the fiducial plane, laboratory frame.
+    residual_um : ndarray of shape (n,)
+        Fiducial marks: radial error in the plane; control points: line-to-focus distance; else NaN.
+    used : ndarray of bool, shape (n,)
+        Fiducial marks and control points that the solution rests on.
+    flags : ndarray of int, shape (n,)
+        To be added to those of the points.
+    mark : ndarray of int, shape (n,)
+        Index into ``cage.mark``; -1 for all other points.
+    focus_by_image : ndarray of shape (n, 3, 2)
+        Change of the focus for a shift of each control point's image on the film, mm/px; 0 for all other points.
+    """
+
+    solution: FocusSolution
+    plane_mm: Float
+    residual_um: Float
+    used: Bool
+    flags: Int
+    mark: Int
+    focus_by_image: Float
+
+
+def solve_focus(points: ImagePoints, cage: Cage, focus: int, limits: Limits) -> FocusFit:
+    """Fit the fiducial plane to the film and locate the focus, with the rules for gross errors.
+
+    Parameters
+    ----------
+    points : ImagePoints
+        The points of this focus, at least its fiducial marks and control points; others are only transformed.
+    cage : Cage
+        At the temperature of the examination.
+    focus : int
+    limits : Limits
+        ``fiducial_um`` and ``line_mm`` are used.
+
+    Returns
+    -------
+    FocusFit
+
+    Raises
+    ------
+    GeometryError
+        If the points do not determine the plane or the focus, a number occurs twice, or is that of no mark of the cage.
+
+    Notes
+    -----
+    Covariances are propagated to first order through both steps (implicit functions). Points without covariance get the image error that
+    the residuals show. Where the residuals are significantly larger than stated covariances predict, these are inflated (Birge ratio).
+    """
+    try:
+        return _solve(points, cage, focus, limits)
+    except GeometryError as error:
+        raise GeometryError(f"focus {focus}: {error}") from error
+
+
+def rays_of(
+    position_px: Float,
+    covariance_px2: Float,
+    solution: FocusSolution,
+    cage: Cage,
+    image: Int | None = None,
+    focus_by_image: Float | None = None,
+) -> RayBundle:
+    """Return the rays from a focus to images on its film, with the errors of image, homography and focus.
+
+    Parameters
+    ----------
+    position_px : ndarray of shape (n, 2)
+    covariance_px2 : ndarray of shape (n, 2, 2)
+        NaN where not known: then the error that the cage's marks show on this film stands in.
+    solution : FocusSolution
+    cage : Cage
+        The one that was solved with.
+    image : ndarray of int, shape (n,), optional
+        Names the rays; default 0, 1, 2 ...
+    focus_by_image : ndarray of shape (n, 3, 2), optional
+        As of :class:`FocusFit`, for images that the focus itself was computed from.
+
+    Returns
+    -------
+    RayBundle
+    """
+    n = len(position_px)
+    origin, basis = cage.plane_of(solution.focus).lab_from_plane()
+    through = origin + apply_homography(solution.plane_from_film, position_px) @ basis
+    by_point, by_parameter = homography_jacobians(solution.plane_from_film, position_px)
+    own = np.zeros((n, 6, 2))
+    own[:, :3] = basis.T @ by_point
+    if focus_by_image is not None:
+        own[:, 3:] = focus_by_image
+    common = np.zeros((n, 6, 11))
+    common[:, :3, :8] = basis.T @ by_parameter
+    common[:, 3:, 8:] = np.eye(3)
+    stated = _stated_covariance(position_px, covariance_px2, solution.image_sd_px) * solution.fiducial_birge**2
+    # the focus's own covariance has the part of these images already: only their correlation with the ray is new
+    covariance = own @ stated @ own.swapaxes(1, 2)
+    covariance[:, 3:, 3:] = 0
+    covariance += common @ solution.parameter_covariance @ common.swapaxes(1, 2)
+    return RayBundle(
+        np.arange(n) if image is None else image,
+        np.full(n, solution.focus, np.int64),
+        np.tile(solution.position_mm, (n, 1)),
+        through,
+        covariance,
+        common @ solution.cage_effect,
+    )
+
+
+def _solve(points: ImagePoints, cage: Cage, focus: int, limits: Limits) -> FocusFit:
+    px = points.position_px
+    flags, mark = _match(points, cage, focus)
+    fiducials = np.flatnonzero((mark >= 0) & (points.role == "fiducial"))
+    controls = np.flatnonzero((mark >= 0) & (points.role == "control"))
+    origin, basis = cage.plane_of(focus).lab_from_plane()
+    xyz = np.array([item.xyz for item in cage.mark])
+    given_uv = (xyz[mark[fiducials]] - origin) @ basis.T
+
+    def fit_plane(index: Int) -> tuple[Float, Float]:
+        matrix = fit_homography(px[fiducials[index]], given_uv[index])
+        return matrix, np.linalg.norm(apply_homography(matrix, px[fiducials[index]]) - given_uv[index], axis=1) * UM_PER_MM
+
+    matrix, kept_fiducials = drop_gross_errors(len(fiducials), fit_plane, limits.fiducial_um)
+    plane = origin + apply_homography(matrix, px) @ basis
+
+    def fit_focus(index: Int) -> tuple[tuple[Float, Float], Float]:
+        found = locate_focus(plane[controls[index]], xyz[mark[controls[index]]])
+        return found, np.linalg.norm(found[1], axis=1)
+
+    (position, line_residuals), kept_controls = drop_gross_errors(len(controls), fit_focus, limits.line_mm)
+
+    residual = np.full(len(px), np.nan)
+    shift = apply_homography(matrix, px[fiducials]) - given_uv
+    residual[fiducials] = np.linalg.norm(shift, axis=1) * UM_PER_MM
+    along = xyz[mark[controls]] - plane[controls]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    residual[controls] = np.linalg.norm(np.cross(along, position - plane[controls]), axis=1) * UM_PER_MM
+    used = np.zeros(len(px), bool)
+    used[fiducials[kept_fiducials]] = True
+    used[controls[kept_controls]] = True
+    flags[fiducials[~used[fiducials]]] |= MarkerFlag.REJECTED
+    flags[controls[~used[controls]]] |= MarkerFlag.REJECTED
+    limit_um = np.where(points.role == "fiducial", limits.fiducial_um, limits.line_mm * UM_PER_MM)
+    flags[used & (residual > limit_um)] |= MarkerFlag.LARGE_RESIDUAL  # the rule stopped at four marks
+
+    rows, lines = fiducials[kept_fiducials], controls[kept_controls]
+    first = homography_errors(matrix, px[rows])
+    second = resection_errors(matrix, basis, px[lines], plane[lines], xyz[mark[lines]], position)
+    cage_steps = _cage_steps(cage, mark[rows], mark[lines], given_uv[kept_fiducials], origin, basis, position)
+    errors = _propagate(points, rows, lines, first, second, cage_steps, shift[kept_fiducials].ravel(), line_residuals.ravel())
+    focus_by_image = np.zeros((len(px), 3, 2))
+    focus_by_image[lines] = second.focus_by_image.reshape(3, -1, 2).swapaxes(0, 1) * errors.control_birge
+    by_cage = errors.cage_effect[8:]
+    radial, distance = residual[rows], residual[lines]
+    solution = FocusSolution(
+        focus,
+        matrix,
+        position,
+        errors.parameter_covariance[8:, 8:] + by_cage @ by_cage.T,
+        float(np.sqrt((radial**2).mean())),
+        float(radial.max()),
+        float(np.sqrt((distance**2).mean())),
+        float(distance.max()),
+        len(rows),
+        len(lines),
+        errors.fiducial_birge,
+        errors.control_birge,
+        errors.image_sd_px,
+        errors.parameter_covariance,
+        errors.cage_effect,
+    )
+    return FocusFit(solution, plane, residual, used, flags, mark, focus_by_image)
+
+
+def _match(points: ImagePoints, cage: Cage, focus: int) -> tuple[Int, Int]:
+    """Return new flags, and the index into ``cage.mark`` of every fiducial mark and control point."""
+    flags = np.where(np.isfinite(points.covariance_px2).all(axis=(1, 2)), MarkerFlag.NONE, MarkerFlag.NO_COVARIANCE).astype(np.int64)
+    known: dict[tuple[str, str, int], int] = {
+        (item.role, str(item.number), seen): index for index, item in enumerate(cage.mark) for seen in item.foci
+    }
+    mark = np.full(len(points), -1)
+    for row in np.flatnonzero((points.role == "fiducial") | (points.role == "control")):
+        role, number = str(points.role[row]), str(points.number[row])
+        index = known.get((role, number, focus), -1)
+        if index >= 0 and (mark == index).any():
+            raise GeometryError(f"{role} mark {number} occurs twice: give every image its own number")
+        if index < 0 and not any(key[:2] == (role, number) for key in known):
+            raise GeometryError(f"there is no {role} mark {number} in cage {cage.name}: correct the number, or choose the right cage")
+        if index < 0:
+            flags[row] |= MarkerFlag.FOREIGN_MARK
+        elif np.isfinite(points.position_px[row]).all():
+            mark[row] = index
+    return flags, mark
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CageSteps:
+    """Shifts for one standard deviation of each of the m cage coordinates: fiducial marks in the plane, and control points."""
+
+    fiducials: Float  # (2 n, m)
+    controls: Float  # (3 n, m)
+
+
+def _cage_steps(
+    cage: Cage, fiducials: Int, controls: Int, given_uv: Float, origin: Float, basis: Float, focus_mm: Float
+) -> _CageSteps:
+    deviations = np.array([item.sd or (0.0, 0.0, 0.0) for item in cage.mark])
+    count = 3 * len(cage.mark) if deviations.any() else 0
+    on_plane, in_space = np.zeros((len(fiducials), 2, count)), np.zeros((len(controls), 3, count))
+    if count:
+        normal = np.cross(basis[0], basis[1])
+        height = (focus_mm - origin) @ normal
+        foot = (focus_mm - origin) @ basis.T
+        for row, index in enumerate(fiducials):
+            # a mark off the plane is seen along its ray
+            seen = basis + np.outer((given_uv[row] - foot) / height, normal)
+            on_plane[row, :, 3 * index : 3 * index + 3] = seen * deviations[index]
+        for row, index in enumerate(controls):
+            in_space[row, :, 3 * index : 3 * index + 3] = np.diag(deviations[index])
+    return _CageSteps(on_plane.reshape(-1, count), in_space.reshape(-1, count))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Errors:
+    parameter_covariance: Float
+    cage_effect: Float
+    fiducial_birge: float
+    control_birge: float
+    image_sd_px: float
+
+
+def _propagate(
+    points: ImagePoints,
+    fiducials: Int,
+    controls: Int,
+    first: HomographyErrors,
+    second: ResectionErrors,
+    cage: _CageSteps,
+    radial_mm: Float,
+    line_mm: Float,
+) -> _Errors:
+    """Propagate image and cage errors to the eleven parameters, and test the image errors by both steps' residuals."""
+    px, given = points.position_px, points.covariance_px2
+    residual_by_image = first.residual_gain @ first.plane_by_image
+    parameter_by_image = -first.gain @ first.plane_by_image
+    line_by_fiducial = second.residual_by_parameter @ parameter_by_image
+    image_sd = np.nan
+    if not np.isfinite(given).all():
+        unit = (residual_by_image**2).sum()
+        if unit > 0:
+            image_sd = float(np.sqrt((radial_mm**2).sum() / unit))
+        else:  # four fiducial marks fit exactly: only the lines are redundant
+            unit = (line_by_fiducial**2).sum() + (second.residual_by_image**2).sum()
+            image_sd = float(np.sqrt((line_mm**2).sum() / unit))
+    of_fiducials = blocks(_stated_covariance(px[fiducials], given[fiducials], image_sd))
+    of_controls = blocks(_stated_covariance(px[controls], given[controls], image_sd))
+
+    by_cage = first.residual_gain @ cage.fiducials
+    fiducial_birge = birge_factor(radial_mm, residual_by_image @ of_fiducials @ residual_by_image.T + by_cage @ by_cage.T)
+    of_fiducials, of_controls = of_fiducials * fiducial_birge**2, of_controls * fiducial_birge**2
+    parameters_by_cage = first.gain @ cage.fiducials
+    by_cage = second.residual_by_parameter @ parameters_by_cage + second.residual_by_mark @ cage.controls
+    control_birge = birge_factor(
+        line_mm,
+        line_by_fiducial @ of_fiducials @ line_by_fiducial.T
+        + second.residual_by_image @ of_controls @ second.residual_by_image.T
+        + by_cage @ by_cage.T,
+    )
+
+    all_by_parameter = np.vstack([np.eye(8), control_birge * second.focus_by_parameter])
+    all_by_fiducial = all_by_parameter @ parameter_by_image
+    covariance = all_by_fiducial @ of_fiducials @ all_by_fiducial.T
+    covariance[8:, 8:] += control_birge**2 * second.focus_by_image @ of_controls @ second.focus_by_image.T
+    effect = all_by_parameter @ parameters_by_cage
+    effect[8:] += control_birge * second.focus_by_mark @ cage.controls
+    return _Errors(covariance, effect, fiducial_birge, control_birge, image_sd)
+
+
+def _stated_covariance(px: Float, covariance_px2: Float, image_sd_px: float) -> Float:
+    """Fill in what was not given, and keep exact coordinates from having less error than their own rounding."""
+    known = np.isfinite(covariance_px2).all(axis=(1, 2), keepdims=True)
+    filled = np.where(known, covariance_px2, image_sd_px**2 * np.eye(2))
+    floor = ROUNDING * np.nanmax(np.abs(px), initial=0.0)
+    result: Float = filled + floor**2 * np.eye(2)
+    return result
