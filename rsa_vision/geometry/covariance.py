@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from rsa_vision.geometry.homography import homography_jacobians, parameter_gain
 from rsa_vision.geometry.rays import intersection_jacobians
-from rsa_vision.types import Float
+from rsa_vision.types import Float, ImagePoints, Int
 
 SIGNIFICANCE: Final = 0.01  # of residuals that are larger than the stated covariances predict
 ROUNDING: Final = 1e-9  # least standard deviation of an image coordinate, as a fraction of the film: keeps exact input from dividing 0 by 0
@@ -137,3 +137,97 @@ def resection_errors(
     return ResectionErrors(
         parameter[0], image[0], mark[0], *(part[1:].reshape(3 * n, -1) for part in (parameter, image, mark))
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FocusErrors:
+    """Errors of the eleven parameters of a focus, fields as in :class:`rsa_vision.types.FocusSolution`."""
+
+    parameter_covariance: Float
+    cage_effect: Float
+    fiducial_birge: float
+    control_birge: float
+    image_sd_px: float
+
+
+def propagate(
+    points: ImagePoints,
+    rows: tuple[Int, Int],
+    steps: tuple[HomographyErrors, ResectionErrors],
+    cage_mm: tuple[Float, Float],
+    residuals_mm: tuple[Float, Float],
+) -> FocusErrors:
+    """Propagate image and cage errors to the parameters of a focus, and test the image errors by both steps' residuals.
+
+    Parameters
+    ----------
+    points : ImagePoints
+    rows : pair of ndarray of int, shape (n,) and (k,)
+        The fiducial marks and the control points used.
+    steps : HomographyErrors, ResectionErrors
+    cage_mm : pair of ndarray, shape (2 n, m) and (3 k, m)
+        Shifts of the fiducial marks in the plane, and of the control points, for one standard deviation of each cage coordinate.
+    residuals_mm : pair of ndarray, shape (2 n,) and (3 k,)
+        Of both steps.
+
+    Returns
+    -------
+    FocusErrors
+    """
+    (fiducials, controls), (first, second) = rows, steps
+    (fiducial_shift, control_shift), (radial_mm, line_mm) = cage_mm, residuals_mm
+    px, given = points.position_px, points.covariance_px2
+    residual_by_image = first.residual_gain @ first.plane_by_image
+    parameter_by_image = -first.gain @ first.plane_by_image
+    line_by_fiducial = second.residual_by_parameter @ parameter_by_image
+    image_sd = np.nan
+    if not np.isfinite(given).all():
+        unit = (residual_by_image**2).sum()
+        if unit > 0:
+            image_sd = float(np.sqrt((radial_mm**2).sum() / unit))
+        else:  # four fiducial marks fit exactly: only the lines are redundant
+            unit = (line_by_fiducial**2).sum() + (second.residual_by_image**2).sum()
+            image_sd = float(np.sqrt((line_mm**2).sum() / unit))
+    of_fiducials = blocks(filled_covariance(px[fiducials], given[fiducials], image_sd))
+    of_controls = blocks(filled_covariance(px[controls], given[controls], image_sd))
+
+    by_cage = first.residual_gain @ fiducial_shift
+    fiducial_birge = birge_factor(radial_mm, residual_by_image @ of_fiducials @ residual_by_image.T + by_cage @ by_cage.T)
+    of_fiducials, of_controls = of_fiducials * fiducial_birge**2, of_controls * fiducial_birge**2
+    parameters_by_cage = first.gain @ fiducial_shift
+    by_cage = second.residual_by_parameter @ parameters_by_cage + second.residual_by_mark @ control_shift
+    control_birge = birge_factor(
+        line_mm,
+        line_by_fiducial @ of_fiducials @ line_by_fiducial.T
+        + second.residual_by_image @ of_controls @ second.residual_by_image.T
+        + by_cage @ by_cage.T,
+    )
+
+    all_by_parameter = np.vstack([np.eye(8), control_birge * second.focus_by_parameter])
+    all_by_fiducial = all_by_parameter @ parameter_by_image
+    covariance = all_by_fiducial @ of_fiducials @ all_by_fiducial.T
+    covariance[8:, 8:] += control_birge**2 * second.focus_by_image @ of_controls @ second.focus_by_image.T
+    effect = all_by_parameter @ parameters_by_cage
+    effect[8:] += control_birge * second.focus_by_mark @ control_shift
+    return FocusErrors(covariance, effect, fiducial_birge, control_birge, image_sd)
+
+
+def filled_covariance(px: Float, covariance_px2: Float, image_sd_px: float) -> Float:
+    """Fill in covariances that were not given, and keep exact coordinates from having less error than their own rounding.
+
+    Parameters
+    ----------
+    px : ndarray of shape (n, 2)
+    covariance_px2 : ndarray of shape (n, 2, 2)
+        NaN where not given.
+    image_sd_px : float
+
+    Returns
+    -------
+    ndarray of shape (n, 2, 2)
+    """
+    known = np.isfinite(covariance_px2).all(axis=(1, 2), keepdims=True)
+    filled = np.where(known, covariance_px2, image_sd_px**2 * np.eye(2))
+    floor = ROUNDING * np.nanmax(np.abs(px), initial=0.0)
+    result: Float = filled + floor**2 * np.eye(2)
+    return result

@@ -9,15 +9,7 @@ import numpy as np
 from rsa_vision.cages import Cage
 from rsa_vision.errors import GeometryError
 from rsa_vision.flags import MarkerFlag
-from rsa_vision.geometry.covariance import (
-    ROUNDING,
-    HomographyErrors,
-    ResectionErrors,
-    birge_factor,
-    blocks,
-    homography_errors,
-    resection_errors,
-)
+from rsa_vision.geometry.covariance import filled_covariance, homography_errors, propagate, resection_errors
 from rsa_vision.geometry.gross_errors import drop_gross_errors
 from rsa_vision.geometry.homography import apply_homography, fit_homography, homography_jacobians
 from rsa_vision.geometry.rays import RayBundle
@@ -129,7 +121,7 @@ def rays_of(
     common = np.zeros((n, 6, 11))
     common[:, :3, :8] = basis.T @ by_parameter
     common[:, 3:, 8:] = np.eye(3)
-    stated = _stated_covariance(position_px, covariance_px2, solution.image_sd_px) * solution.fiducial_birge**2
+    stated = filled_covariance(position_px, covariance_px2, solution.image_sd_px) * solution.fiducial_birge**2
     # the focus's own covariance has the part of these images already: only their correlation with the ray is new
     covariance = own @ stated @ own.swapaxes(1, 2)
     covariance[:, 3:, 3:] = 0
@@ -183,17 +175,17 @@ def _solve(points: ImagePoints, cage: Cage, focus: int, limits: Limits) -> Focus
     rows, lines = fiducials[kept_fiducials], controls[kept_controls]
     first = homography_errors(matrix, px[rows])
     second = resection_errors(matrix, basis, px[lines], plane[lines], xyz[mark[lines]], position)
-    cage_steps = _cage_steps(cage, mark[rows], mark[lines], given_uv[kept_fiducials], origin, basis, position)
-    errors = _propagate(points, rows, lines, first, second, cage_steps, shift[kept_fiducials].ravel(), line_residuals.ravel())
+    by_cage = _cage_steps(cage, mark[rows], mark[lines], given_uv[kept_fiducials], origin, basis, position)
+    errors = propagate(points, (rows, lines), (first, second), by_cage, (shift[kept_fiducials].ravel(), line_residuals.ravel()))
     focus_by_image = np.zeros((len(px), 3, 2))
     focus_by_image[lines] = second.focus_by_image.reshape(3, -1, 2).swapaxes(0, 1) * errors.control_birge
-    by_cage = errors.cage_effect[8:]
+    effect = errors.cage_effect[8:]
     radial, distance = residual[rows], residual[lines]
     solution = FocusSolution(
         focus,
         matrix,
         position,
-        errors.parameter_covariance[8:, 8:] + by_cage @ by_cage.T,
+        errors.parameter_covariance[8:, 8:] + effect @ effect.T,
         float(np.sqrt((radial**2).mean())),
         float(radial.max()),
         float(np.sqrt((distance**2).mean())),
@@ -230,17 +222,10 @@ def _match(points: ImagePoints, cage: Cage, focus: int) -> tuple[Int, Int]:
     return flags, mark
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _CageSteps:
-    """Shifts for one standard deviation of each of the m cage coordinates: fiducial marks in the plane, and control points."""
-
-    fiducials: Float  # (2 n, m)
-    controls: Float  # (3 n, m)
-
-
 def _cage_steps(
     cage: Cage, fiducials: Int, controls: Int, given_uv: Float, origin: Float, basis: Float, focus_mm: Float
-) -> _CageSteps:
+) -> tuple[Float, Float]:
+    """Shifts for one standard deviation of each of the m cage coordinates: fiducial marks in the plane (2 n, m), controls (3 n, m)."""
     deviations = np.array([item.sd or (0.0, 0.0, 0.0) for item in cage.mark])
     count = 3 * len(cage.mark) if deviations.any() else 0
     on_plane, in_space = np.zeros((len(fiducials), 2, count)), np.zeros((len(controls), 3, count))
@@ -254,69 +239,4 @@ def _cage_steps(
             on_plane[row, :, 3 * index : 3 * index + 3] = seen * deviations[index]
         for row, index in enumerate(controls):
             in_space[row, :, 3 * index : 3 * index + 3] = np.diag(deviations[index])
-    return _CageSteps(on_plane.reshape(-1, count), in_space.reshape(-1, count))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Errors:
-    parameter_covariance: Float
-    cage_effect: Float
-    fiducial_birge: float
-    control_birge: float
-    image_sd_px: float
-
-
-def _propagate(
-    points: ImagePoints,
-    fiducials: Int,
-    controls: Int,
-    first: HomographyErrors,
-    second: ResectionErrors,
-    cage: _CageSteps,
-    radial_mm: Float,
-    line_mm: Float,
-) -> _Errors:
-    """Propagate image and cage errors to the eleven parameters, and test the image errors by both steps' residuals."""
-    px, given = points.position_px, points.covariance_px2
-    residual_by_image = first.residual_gain @ first.plane_by_image
-    parameter_by_image = -first.gain @ first.plane_by_image
-    line_by_fiducial = second.residual_by_parameter @ parameter_by_image
-    image_sd = np.nan
-    if not np.isfinite(given).all():
-        unit = (residual_by_image**2).sum()
-        if unit > 0:
-            image_sd = float(np.sqrt((radial_mm**2).sum() / unit))
-        else:  # four fiducial marks fit exactly: only the lines are redundant
-            unit = (line_by_fiducial**2).sum() + (second.residual_by_image**2).sum()
-            image_sd = float(np.sqrt((line_mm**2).sum() / unit))
-    of_fiducials = blocks(_stated_covariance(px[fiducials], given[fiducials], image_sd))
-    of_controls = blocks(_stated_covariance(px[controls], given[controls], image_sd))
-
-    by_cage = first.residual_gain @ cage.fiducials
-    fiducial_birge = birge_factor(radial_mm, residual_by_image @ of_fiducials @ residual_by_image.T + by_cage @ by_cage.T)
-    of_fiducials, of_controls = of_fiducials * fiducial_birge**2, of_controls * fiducial_birge**2
-    parameters_by_cage = first.gain @ cage.fiducials
-    by_cage = second.residual_by_parameter @ parameters_by_cage + second.residual_by_mark @ cage.controls
-    control_birge = birge_factor(
-        line_mm,
-        line_by_fiducial @ of_fiducials @ line_by_fiducial.T
-        + second.residual_by_image @ of_controls @ second.residual_by_image.T
-        + by_cage @ by_cage.T,
-    )
-
-    all_by_parameter = np.vstack([np.eye(8), control_birge * second.focus_by_parameter])
-    all_by_fiducial = all_by_parameter @ parameter_by_image
-    covariance = all_by_fiducial @ of_fiducials @ all_by_fiducial.T
-    covariance[8:, 8:] += control_birge**2 * second.focus_by_image @ of_controls @ second.focus_by_image.T
-    effect = all_by_parameter @ parameters_by_cage
-    effect[8:] += control_birge * second.focus_by_mark @ cage.controls
-    return _Errors(covariance, effect, fiducial_birge, control_birge, image_sd)
-
-
-def _stated_covariance(px: Float, covariance_px2: Float, image_sd_px: float) -> Float:
-    """Fill in what was not given, and keep exact coordinates from having less error than their own rounding."""
-    known = np.isfinite(covariance_px2).all(axis=(1, 2), keepdims=True)
-    filled = np.where(known, covariance_px2, image_sd_px**2 * np.eye(2))
-    floor = ROUNDING * np.nanmax(np.abs(px), initial=0.0)
-    result: Float = filled + floor**2 * np.eye(2)
-    return result
+    return on_plane.reshape(2 * len(fiducials), count), in_space.reshape(3 * len(controls), count)
