@@ -1,0 +1,81 @@
+"""Where a focus may be: all places from which enough control points fall onto images.
+
+The image of a control point, moved to the fiducial plane, and the control point fix a line through the focus. Two of them fix the focus; it
+then predicts the images of all other control points.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from rsa_vision.geometry.rays import closest_approach
+from rsa_vision.identify.grids import needed
+from rsa_vision.types import Float
+
+NEAR_MM: Final = 1.2  # images in the plane: the grid is known to some tenths of a millimetre, the focus by two points only
+LARGEST: Final = 4  # places that are returned
+MOST_LINES: Final = 400
+
+
+def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm: float) -> list[tuple[Float, int]]:
+    """Find places of a focus.
+
+    Parameters
+    ----------
+    images_mm : ndarray of shape (n, 2)
+        All images of the film, transformed to the fiducial plane of this focus.
+    controls_mm : ndarray of shape (m, 3)
+        Control points in the plane frame.
+    nominal_mm : ndarray of shape (3,)
+    reach_mm : float
+        Largest distance from the nominal focus.
+
+    Returns
+    -------
+    list of (ndarray of shape (3,), int)
+        Places and the number of control points with an image there, best first.
+    """
+    least = needed(len(controls_mm), 2)
+    through = np.column_stack([images_mm, np.zeros(len(images_mm))])
+    towards = controls_mm[:, None] - through[None]
+    distance = np.linalg.norm(np.cross(towards, nominal_mm - through[None]), axis=-1) / np.linalg.norm(towards, axis=-1)
+    slack = NEAR_MM * nominal_mm[2] / np.abs(controls_mm[:, 2]).clip(1.0)
+    mark, image = np.nonzero(distance < reach_mm + slack[:, None])
+    if len(np.unique(mark)) < least:
+        return []
+    if len(mark) > MOST_LINES:
+        nearest = np.argsort(distance[mark, image])[:MOST_LINES]
+        mark, image = mark[nearest], image[nearest]
+    spread = np.linalg.norm(controls_mm[:, None] - controls_mm[None], axis=-1)
+    first, second = np.triu_indices(len(mark), 1)
+    wide = (spread[mark[first], mark[second]] > 0.35 * spread.max()) & (image[first] != image[second])
+    first, second = first[wide], second[wide]
+    near_a, near_b, *_ = closest_approach(
+        through[image[first]], controls_mm[mark[first]], through[image[second]], controls_mm[mark[second]]
+    )
+    focus = (near_a + near_b) / 2
+    with np.errstate(invalid="ignore"):
+        crossing = np.linalg.norm(near_a - near_b, axis=1) < slack[mark[first]] + slack[mark[second]]
+        focus = focus[crossing & (np.linalg.norm(focus - nominal_mm, axis=1) < reach_mm * 1.1 + 20)]
+    if not len(focus):
+        return []
+    rise = controls_mm[None, :, 2] / (focus[:, None, 2] - controls_mm[None, :, 2])
+    predicted = controls_mm[None, :, :2] + (controls_mm[None, :, :2] - focus[:, None, :2]) * rise[..., None]
+    hit = np.zeros(predicted.shape[:2], bool)
+    squared = np.zeros(len(focus))
+    for m in range(len(controls_mm)):  # only images that were possible for this mark at all
+        options = images_mm[image[mark == m]]
+        if len(options):
+            best = ((predicted[:, m, None] - options[None]) ** 2).sum(-1).min(axis=1)
+            hit[:, m] = best < NEAR_MM**2
+            squared += np.minimum(best, NEAR_MM**2)
+    votes = hit.sum(axis=1)
+    found: list[tuple[Float, int]] = []
+    for index in np.lexsort((squared, -votes)):
+        if votes[index] < least or len(found) >= LARGEST:
+            break
+        if all(np.abs(focus[index, :2] - other[:2]).max() > 12 or abs(focus[index, 2] - other[2]) > 60 for other, _ in found):
+            found.append((focus[index], int(votes[index])))
+    return found
