@@ -9,11 +9,9 @@ import numpy as np
 from rsa_vision.cages import Cage, load_cage
 from rsa_vision.types import ImagePoints
 
-OBJECTS = np.array(
-    [(-45, 55, 40), (45, 55, 40), (-45, 145, 40), (45, 145, 40), (0, 100, 40), (-40, 60, 90), (40, 60, 90), (-40, 140, 90), (40, 140, 90)]
-    + [(0, 100, 90), (10, 80, 65), (-20, 120, 70), (25, 95, 55)],
-    float,
-)
+LOWER = [(-45, 55, 40), (45, 55, 40), (-45, 145, 40), (45, 145, 40), (0, 100, 40)]
+UPPER = [(-40, 60, 90), (40, 60, 90), (-40, 140, 90), (40, 140, 90), (0, 100, 90), (10, 80, 65), (-20, 120, 70), (25, 95, 55)]
+OBJECTS = np.array([*LOWER, *UPPER], float)
 
 
 def objects_of(cage: Cage) -> np.ndarray:
