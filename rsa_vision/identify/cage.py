@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rsa_vision.cages import Cage
-from rsa_vision.identify.film_model import FILM, GAP_MM, Scene, build_scene, plane_from_film, project
+from rsa_vision.identify.film_model import FILM, GAP_MM, Scene, build_scene, plane_from_film
 from rsa_vision.identify.focus_search import NEAR_MM, find_foci
-from rsa_vision.identify.grids import find_grids, needed
+from rsa_vision.identify.grids import find_grids
 from rsa_vision.identify.naming import (
     FilmImages,
     Naming,
@@ -26,6 +26,7 @@ from rsa_vision.identify.naming import (
     drop_gross_errors,
     film_images,
     name_marks,
+    on_bodies,
     without,
 )
 from rsa_vision.settings import Limits
@@ -37,10 +38,11 @@ FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than 
 LOG_FAR: Final = 7.0  # a focus beyond the limit is that much less likely
 LOG_FALSE: Final = 16.0  # evidence against clutter that is demanded: one false cage in 1e7 films
 WEIGHED: Final = 10  # hypotheses that are fitted
+FOUND: Final = 0.5  # of the fiducial marks and of the control points of a focus must be named
 AGREEING: Final = 0.5  # of the named images must have the shape, and of the tees the direction, of their marks
 TURNED_DEG: Final = 25.0
 
-_Place = tuple[Float, Float, Float, Bool]  # film from plane (A, b), focus, images explained
+_Place = tuple[Float, Float, Float, Int]  # film from plane (A, b), focus, image of every mark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,7 +156,7 @@ def _film_images(images: MarkerImages, usable: Int, to_film: Float, flip: float,
     covariance += (0.002 * scale) ** 2 * np.eye(2)  # a covariance of zero would outweigh all else
     angle = np.deg2rad(images.angle_deg[usable])
     angle = np.arctan2(np.sin(angle), flip * np.cos(angle))
-    return film_images(xy, covariance, images.shape[usable], angle, area_mm2)
+    return film_images(xy, covariance, images.shape[usable], angle, images.radius_px[usable] * scale, area_mm2)
 
 
 def _hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, limits: Limits) -> list[Float]:
@@ -174,7 +176,7 @@ def _hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, limits: Limits) -> 
             grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=len(scene.foci), largest_shift_mm=shift)
         options.append(
             [
-                (A, b, focus, _explained(scene.xyz_mm[mine], focus, A, b, tree))
+                (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))
                 for A, b, _ in grids[key]
                 for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach)
             ]
@@ -183,26 +185,27 @@ def _hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, limits: Limits) -> 
     choices = np.array(list(product(*(range(len(o)) for o in options))), dtype=int).reshape(-1, len(options))
     if not len(choices):
         return []
-    union = np.zeros((len(choices), len(xy_mm)), bool)
+    union = np.zeros((len(choices), tree.n + 1), bool)
     for k, some in enumerate(options):
-        union |= np.array([place[3] for place in some])[choices[:, k]]
-    found: list[Float] = []
-    for index in np.argsort(-union.sum(axis=1), kind="stable"):
-        start = _start(scene, [options[k][choice] for k, choice in enumerate(choices[index])])
-        if start is not None:
-            found.append(start)
+        explained = np.zeros((len(some), tree.n + 1), bool)
+        for row, place in zip(explained, some, strict=True):
+            row[place[3]] = True
+        union |= explained[choices[:, k]]
+    found: dict[bytes, Float] = {}
+    for index in np.argsort(-union[:, :-1].sum(axis=1), kind="stable"):
+        places = [options[k][choice] for k, choice in enumerate(choices[index])]
+        names = np.concatenate([place[3] for place in places]).tobytes()
+        if names not in found and (start := _start(scene, places)) is not None:
+            found[names] = start
             if len(found) >= WEIGHED:
                 break
-    return found
+    return list(found.values())
 
 
-def _explained(xyz_mm: Float, focus: Float, A: Float, b: Float, tree: cKDTree) -> Bool:
-    """Return which images lie where a focus would show marks."""
+def _seen(xyz_mm: Float, focus: Float, A: Float, b: Float, tree: cKDTree) -> Int:
+    """Return the image at the place where a focus would show each mark; one more than the last for none."""
     place = xyz_mm[:, :2] + (xyz_mm[:, :2] - focus[:2]) * (xyz_mm[:, 2] / (focus[2] - xyz_mm[:, 2]))[:, None]
-    distance, index = tree.query(place @ A.T + b, distance_upper_bound=NEAR_MM)
-    explained = np.zeros(tree.n, bool)
-    explained[index[np.isfinite(distance)]] = True
-    return explained
+    return np.asarray(tree.query(place @ A.T + b, distance_upper_bound=NEAR_MM)[1], dtype=np.int64)
 
 
 def _start(scene: Scene, choice: Sequence[_Place]) -> Float | None:
@@ -282,7 +285,7 @@ def _missing(scene: Scene, naming: Naming) -> str:
         for fiducial, least, name in ((True, 4, "fiducial marks"), (False, 2, "control points")):
             wanted = scene.own & (scene.focus == k) & (scene.fiducial == fiducial)
             seen = int((naming.image[wanted] >= 0).sum())
-            if seen < needed(int(wanted.sum()), least):
+            if seen < max(least, np.ceil(FOUND * wanted.sum())):
                 return f"only {seen} of {wanted.sum()} {name} of focus {focus}"
     return ""
 
@@ -394,13 +397,7 @@ class _Answer:
 def _parts(scene: Scene, naming: Naming, film: FilmImages) -> Int:
     """Return images that are no markers of their own: on the pins of a mark, or a second answer to one mark."""
     parameters = naming.fit.parameters
-    named = np.unique(naming.image[naming.rows])
-    left = np.setdiff1d(np.arange(len(film.xy_mm)), named)
-    if not len(left):
-        return left
-    place = project(scene, parameters)
-    focus = parameters[FILM:].reshape(-1, 3)[scene.focus]
-    reach = scene.reach_mm * focus[:, 2] / (focus[:, 2] - scene.xyz_mm[:, 2]) * 1.15
-    seen = scene.own | (naming.image >= 0)
-    near = np.hypot(*(film.xy_mm[left][:, None] - place[seen][None]).transpose(2, 0, 1)) < reach[seen]
-    return left[near.any(axis=1)]
+    left = np.setdiff1d(np.arange(len(film.xy_mm)), naming.image)
+    rows = np.flatnonzero(scene.own | (naming.image >= 0))
+    parts: Int = left[on_bodies(scene, parameters, film, rows)[:, left].any(axis=0)]
+    return parts

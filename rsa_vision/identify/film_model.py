@@ -50,8 +50,8 @@ class Scene:
     shape : ndarray of str, shape (m,)
     size_mm : ndarray of shape (m,)
         Diameter of a ball or of the pins.
-    reach_mm : ndarray of shape (m,)
-        How far the mark reaches from its reference point.
+    arms_mm : ndarray of shape (m, a, 3)
+        Pins of the mark, from its reference point to their thick ends; NaN where it has fewer.
     mark : ndarray of int, shape (m,)
         Index into ``cage.mark``.
     """
@@ -68,7 +68,7 @@ class Scene:
     fiducial: Bool
     shape: Str
     size_mm: Float
-    reach_mm: Float
+    arms_mm: Float
     mark: Int
 
     def lab_mm(self, uvw: Float) -> Float:
@@ -119,9 +119,17 @@ def build_scene(cage: Cage, foci: tuple[int, ...], foci_mm: dict[int, Float]) ->
         (fiducial & own)[keep],
         np.tile([m.shape for m in cage.mark], len(foci))[keep],
         np.tile([m.diameter for m in cage.mark], len(foci))[keep],
-        np.tile([m.length or m.diameter / 2 for m in cage.mark], len(foci))[keep],
+        np.tile(_arms(cage), (len(foci), 1, 1))[keep] @ frame.T,
         np.tile(np.arange(count), len(foci))[keep],
     )
+
+
+def _arms(cage: Cage) -> Float:
+    arms = np.full((len(cage.mark), max(1, *(len(m.arms) for m in cage.mark)), 3), np.nan)
+    for row, mark in zip(arms, cage.mark, strict=True):
+        for place, arm in zip(row, mark.arms, strict=False):
+            place[:] = np.array(arm) * (mark.length or mark.diameter) / np.linalg.norm(arm)
+    return arms
 
 
 def _stem(mark: Mark) -> tuple[float, float, float]:
@@ -266,7 +274,7 @@ def fit(scene: Scene, start: Float, rows: Int, observed_mm: Float, covariance_mm
     if sign <= 0:
         raise np.linalg.LinAlgError("not a minimum")
     log_prior = -0.5 * float(prior @ prior) - float(normalisers) - 0.5 * float(log_determinant) + 1.5 * np.log(2 * np.pi) - np.log(4)
-    return Fit(parameters, np.linalg.inv(hessian), observed_mm - predicted, slopes, float(log_prior))
+    return Fit(parameters, np.asarray(np.linalg.inv(hessian), float), observed_mm - predicted, slopes, float(log_prior))
 
 
 def plane_from_film(scene: Scene, parameters: Float, focus: int) -> Float:

@@ -153,7 +153,7 @@ def _hypotheses(images: Float, tree: cKDTree, marks: Float, turn_deg: float, lea
         third = images[first] + np.column_stack([z.real * span[:, 0] - z.imag * span[:, 1], z.imag * span[:, 0] + z.real * span[:, 1]])
         reach = 2.2 * SHEAR * float(max(np.hypot(*(marks[c] - marks[a])), np.hypot(*(marks[c] - marks[b])))) + NEAR_MM
         near = min(4, len(images))
-        distance, index = tree.query(third, k=near, distance_upper_bound=reach)
+        distance, index = (np.asarray(part) for part in tree.query(third, k=near, distance_upper_bound=reach))
         pair, which = np.nonzero(np.isfinite(distance.reshape(-1, near)))
         chosen = index.reshape(-1, near)[pair, which]
         corners = np.stack([images[first[pair]], images[second[pair]], images[chosen]], axis=1)
@@ -197,7 +197,7 @@ def _distinct(maps: list[tuple[Float, int]], marks: Float, tolerance: float) -> 
 def _refine(affine: Float, images: Float, tree: cKDTree, marks: Float, least: int) -> tuple[Float, int] | None:
     homogeneous = np.column_stack([marks, np.ones(len(marks))])
     for reach in (1.5 * NEAR_MM, NEAR_MM):
-        distance, index = tree.query(homogeneous @ affine, distance_upper_bound=reach)
+        distance, index = (np.asarray(part) for part in tree.query(homogeneous @ affine, distance_upper_bound=reach))
         near = np.isfinite(distance)
         if near.sum() < least or len(np.unique(index[near])) < least:
             return None
@@ -210,7 +210,7 @@ def _refine(affine: Float, images: Float, tree: cKDTree, marks: Float, least: in
 def _shifts(affine: Float, images: Float, tree: cKDTree, marks: Float, least: int, largest: float) -> list[tuple[Float, int]]:
     """Find by voting the shifts of a grid that again put enough marks onto images, no shift included."""
     places = np.column_stack([marks, np.ones(len(marks))]) @ affine
-    neighbours = tree.query_ball_point(places, largest + NEAR_MM)
+    neighbours = [tree.query_ball_point(place, largest + NEAR_MM) for place in places]
     owner = np.repeat(np.arange(len(marks)), [len(some) for some in neighbours])
     shifts = images[np.concatenate([np.array(some, int) for some in neighbours])] - places[owner]
     close: Int = np.zeros((len(shifts), len(marks)), int)

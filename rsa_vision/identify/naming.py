@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.special import fdtri
 
 from rsa_vision.identify.film_model import FILM, Fit, Scene, fit, project
-from rsa_vision.types import Float, Int, Str
+from rsa_vision.types import Bool, Float, Int, Str
 
 SEEN: Final = 0.9  # probability that a mark has an image
 SEEN_FOREIGN: Final = 0.25  # of a mark that is not meant for the focus: cones and masks hide many
@@ -24,10 +24,13 @@ SLACK_MM: Final = (0.004, 0.08)  # of film, scanner and cage, each coordinate; S
 USUAL_SLACK_MM: Final = 0.02  # weighs like USUAL_COUNT coordinates
 USUAL_COUNT: Final = 6
 STAGES_MM: Final = (0.6, 0.15)  # slack while the model settles
+LEAST_GAP_MM: Final = -1.0  # the film lies behind the plane: exchanged foci would need it before
 GATE: Final = 16.0  # squared distance in sigma
 OUTLIER: Final = 1e-5  # probability of a true mark image being called a gross error
+OUTLIER_UNLIKE: Final = 1e-2  # of an image that does not have the shape of its mark, and so may be something else
 ANGLE_SD_DEG: Final = 5.0
 ANGLE_WRONG: Final = 0.1  # a hidden arm turns the tee
+BODY_MM: Final = 0.15  # blur and the error of a detection that is no marker
 SHAPE_RIGHT: Final = 0.85  # a mark is detected as what it is; hidden arms make a tee a pin or a ball
 
 
@@ -39,18 +42,19 @@ class FilmImages:
     covariance_mm2: Float
     shape: Str
     angle_rad: Float
+    radius_mm: Float
     log_density: Float  # of clutter around each, per mm2
 
 
-def film_images(xy_mm: Float, covariance_mm2: Float, shape: Str, angle_rad: Float, area_mm2: float) -> FilmImages:
+def film_images(xy_mm: Float, covariance_mm2: Float, shape: Str, angle_rad: Float, radius_mm: Float, area_mm2: float) -> FilmImages:
     """Add the density of images around each: letters and screws make clusters, where a chance hit is likelier."""
     n = len(xy_mm)
     density = np.full(n, n / area_mm2)
     k = min(6, n - 1)
     if k >= 3:
-        distance, _ = cKDTree(xy_mm).query(xy_mm, k=[k + 1])
-        density = np.maximum(density, k / (np.pi * np.maximum(distance[:, 0], 0.5) ** 2))
-    return FilmImages(xy_mm, covariance_mm2, shape, angle_rad, np.log(density))
+        distance = np.asarray(cKDTree(xy_mm).query(xy_mm, k=k + 1)[0])[:, k]
+        density = np.maximum(density, k / (np.pi * np.maximum(distance, 0.5) ** 2))
+    return FilmImages(xy_mm, covariance_mm2, shape, angle_rad, radius_mm, np.log(density))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,6 +129,42 @@ def gains(scene: Scene, parameters: Float, images: FilmImages, looks: Float, sla
     return result
 
 
+def on_bodies(scene: Scene, parameters: Float, images: FilmImages, rows: Int) -> Bool:
+    """Tell which images may be parts of the image of a mark rather than markers: shape (len(rows), n).
+
+    A detector may see balls and pins on the pins of a tee. A ball clearly wider than the pins is no part of them, unless where they meet.
+    """
+    place = project(scene, parameters, rows)
+    focus = parameters[FILM:].reshape(-1, 3)[scene.focus[rows], 2]
+    width = scene.size_mm[rows] / 2 * focus / (focus - scene.xyz_mm[rows, 2])
+    offset = images.xy_mm[None] - place[:, None]
+    away = np.hypot(offset[..., 0], offset[..., 1])
+    with np.errstate(invalid="ignore"):
+        wide = (images.shape == "ball") & (images.radius_mm > 1.35 * width[:, None])
+    result: Bool = np.array(away < 1.2 * width[:, None] + BODY_MM, dtype=bool)
+    for arm in range(scene.arms_mm.shape[1]):
+        mine = np.isfinite(scene.arms_mm[rows, arm, 0])
+        if mine.any():
+            which = rows[mine]
+            way = project(scene, parameters, which, xyz_mm=scene.xyz_mm[which] + scene.arms_mm[which, arm]) - place[mine]
+            along = np.clip((offset[mine] * way[:, None]).sum(-1) / (way**2).sum(-1).clip(1e-9)[:, None], 0, 1)
+            rest = offset[mine] - along[..., None] * way[:, None]
+            result[mine] |= (np.hypot(rest[..., 0], rest[..., 1]) < 1.2 * width[mine][:, None] + BODY_MM) & ~wide[mine]
+    return result
+
+
+def _no_parts(scene: Scene, parameters: Float, images: FilmImages, gain: Float, image: Int) -> Float:
+    """Forbid to name images of another shape than the mark's that lie on the body of a named mark."""
+    rows = np.flatnonzero(image >= 0)
+    rows = rows[np.isfinite(scene.arms_mm[rows, 0, 0])]
+    if not len(rows):
+        return gain
+    body = on_bodies(scene, parameters, images, rows)
+    body[np.arange(len(rows)), image[rows]] = False
+    part = body.any(axis=0)
+    return np.where(part[None] & (scene.shape[:, None] != images.shape[None]), -np.inf, gain)
+
+
 def _assign(gain: Float) -> Int:
     """Return the image of every row with the largest total gain, each image once; -1 for none."""
     image = np.full(len(gain), -1)
@@ -180,7 +220,10 @@ def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float) 
     for stage in (*STAGES_MM, None, None):
         slack = stage if stage is not None else slack
         gain = gains(scene, parameters, images, looks, slack)
-        named = _share(scene, parameters, images, gain, _assign(gain)) if stage is None else _assign(gain)
+        named = _assign(gain)
+        if stage is None:
+            gain = _no_parts(scene, parameters, images, gain, named)
+            named = _share(scene, parameters, images, gain, _assign(gain))
         if (named[scene.own] >= 0).sum() < 6:
             return None
         settled = stage is None and fitted is not None and np.array_equal(named, image)
@@ -195,6 +238,8 @@ def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float) 
         parameters = fitted.parameters
         if settled:
             break
+    if parameters[6] < LEAST_GAP_MM:
+        return None
     looks = appearance(scene, parameters, images)
     return _evidence(scene, Naming(image, fitted, slack, 0.0), images, looks, log_room) if fitted is not None else None
 
@@ -244,11 +289,12 @@ def deviations(naming: Naming, images: FilmImages) -> tuple[Float, Float]:
     covariance = images.covariance_mm2[naming.image[rows]] + naming.slack_mm**2 * np.eye(2)
     explained = np.einsum("nip,pq,njq->nij", naming.fit.jacobian, naming.fit.covariance, naming.fit.jacobian)
     rest = covariance - explained
-    trace = np.trace(rest, axis1=1, axis2=2)
-    rest = rest + 1e-6 * np.trace(covariance, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+    value, vector = np.linalg.eigh(rest)
+    least = 1e-4 * np.trace(covariance, axis1=1, axis2=2)[:, None]  # an image that alone fixes a parameter is not predicted by the others
+    rest = vector @ (np.maximum(value, least)[..., None] * vector.swapaxes(1, 2))
     inverse = np.linalg.inv(rest)
     r = naming.fit.residual_mm
-    squared = np.where(trace > 0, np.einsum("ni,nij,nj->n", r, inverse, r), 0.0)
+    squared = np.einsum("ni,nij,nj->n", r, inverse, r)
     return squared, covariance @ inverse @ covariance - covariance
 
 
@@ -258,20 +304,18 @@ def drop_gross_errors(scene: Scene, naming: Naming, images: FilmImages, limit_mm
     while (naming.image[scene.own] >= 0).sum() > 6:
         squared, _ = deviations(naming, images)
         rows = naming.rows
-        worst = int(np.argmax(squared))
-        covariance = images.covariance_mm2[naming.image[rows]]
-        total = covariance + naming.slack_mm**2 * np.eye(2)
-        smallest = (
-            np.trace(covariance, axis1=1, axis2=2).sum() / np.trace(total, axis1=1, axis2=2).sum() + (SLACK_MM[0] / naming.slack_mm) ** 2
-        )
-        others = max(float(np.delete(squared, worst).mean()) / 2, min(float(smallest), 1.0))
-        freedom = 2 * len(rows) - len(naming.fit.parameters)
-        threshold = 2 * fdtri(2, max(freedom - 2, 3), 1 - OUTLIER)
-        radial = np.hypot(*naming.fit.residual_mm.T)
-        if squared[worst] / others < threshold:
-            if radial.max() < limit_mm:
-                break
+        covariance = np.trace(images.covariance_mm2[naming.image[rows]], axis1=1, axis2=2).mean()
+        smallest = (covariance + 2 * SLACK_MM[0] ** 2) / (covariance + 2 * naming.slack_mm**2)
+        others = ((squared.sum() - squared) / (len(rows) - 1) / 2).clip(min(smallest, 1.0))  # variance without the image in question
+        freedom = max(2 * len(rows) - len(naming.fit.parameters) - 2, 3)
+        alike = scene.shape[rows] == images.shape[naming.image[rows]]
+        excess = squared / others / (2 * fdtri(2, freedom, 1 - np.where(alike, OUTLIER, OUTLIER_UNLIKE)))
+        worst = int(np.argmax(excess))
+        if excess[worst] < 1:
+            radial = np.hypot(*naming.fit.residual_mm.T)
             worst = int(np.argmax(radial))
+            if radial[worst] < limit_mm:
+                break
         row = int(rows[worst])
         dropped.append((row, int(naming.image[row])))
         smaller = without(scene, naming, images, [row], log_room)
