@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from rsa_vision.types import Float
 from synthetic.film import FilmPlane
+from synthetic.render import Image
 from synthetic.scene import LEAD_PER_MM, STEEL_PER_MM, TITANIUM_PER_MM, Ellipsoid, Pin, Scene, Solid
 
 Distractor = Literal["screw", "wire", "staple", "letter", "dust", "scratch"]
@@ -131,7 +132,8 @@ def blemishes(kinds: Collection[str], shape: tuple[int, int], rng: np.random.Gen
     return np.asarray(factor)
 
 
-def _speck(factor: np.ndarray, rng: np.random.Generator) -> None:  # type: ignore[type-arg]  # draws into an array of its caller
+def _speck(factor: Image, rng: np.random.Generator) -> None:
+    """Draw one speck of dust into an array of the caller."""
     size = 15
     row, col = (int(rng.integers(0, extent - size)) for extent in factor.shape)
     blot = gaussian_filter(rng.standard_normal((size, size)), rng.uniform(0.8, 2.0))

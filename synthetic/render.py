@@ -138,7 +138,7 @@ def _shadows(scene: Scene, film: FilmPlane, focus: int, beam: Beam, blur_mm: flo
     spot_uv, weights = beam.spot()
     sources = scene.foci_mm[focus] + spot_uv @ film.axes[:2]
     solids = scene.solids(focus)
-    sigma_px = [blur_mm * np.linalg.norm(film.pixel_from_film[axis, :2]) for axis in (1, 0)]
+    sigma_px = [blur_mm * float(np.linalg.norm(film.pixel_from_film[axis, :2])) for axis in (1, 0)]
     reach = [math.ceil(5 * sigma) for sigma in sigma_px]
     jitter = (np.arange(1, len(weights) + 1)[:, None] * (0.7548776662466927, 0.5698402909980532)) % 1.0  # another grid for every source
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -32,12 +32,20 @@ class FilmCurve:
         Density per decade of exposure, at the steepest place.
     middle : float
         Exposure of the steepest place, relative to nothing in the way.
+
+    Notes
+    -----
+    With the default a film's background, at exposure 1, has a density of 1.3.
     """
 
     base: float = 0.2
     range: float = 3.0
     gamma: float = 2.5
-    middle: float = 0.8
+    middle: float = 1.4
+
+    def timed_for(self, exposure: Exposure) -> FilmCurve:
+        """Return the curve of a film exposed so long that its median gets the density meant for exposure 1."""
+        return replace(self, middle=self.middle * float(np.median(exposure.blurred[::8, ::8])))
 
     def density(self, exposure: Float | Image) -> Float:
         """Return the optical density after an exposure."""
@@ -97,7 +105,7 @@ class Scanner:
             return self.curve.density(exposure) / self.full_density
         if self.response == "transmission":
             return np.asarray(10.0 ** -(self.curve.density(exposure) - self.curve.base))
-        relative = np.asarray(exposure) / self.full_exposure
+        relative = np.asarray(exposure, float) / self.full_exposure
         return np.asarray(relative if self.response == "linear" else 1 + np.log10(np.maximum(relative, 10**-self.decades)) / self.decades)
 
     def exposure(self, signal: Float) -> Float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -17,6 +16,8 @@ TANTALUM_PER_MM = 8.0  # effective attenuation at 60-120 kV after filtering by t
 STEEL_PER_MM = 1.2
 TITANIUM_PER_MM = 0.25
 LEAD_PER_MM = 6.0
+MAGNIFICATION = 1.2  # of a ball in the middle of a cage
+TRIES = 1000  # places to try for each object marker
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,6 +164,41 @@ def object_box(cage: Cage) -> Float:
     return np.array([middle - half, middle + half])
 
 
+def clearance_mm(scene: Scene, films: Mapping[int, FilmPlane], *, clear_of_marks: bool = True) -> Float:
+    """Return how far the images of each marker are from all other images on their film and from its edge.
+
+    Parameters
+    ----------
+    scene : Scene
+    films : mapping of int to FilmPlane
+        The film of each focus; foci on one film share the object.
+    clear_of_marks : bool
+        Whether images of cage marks count; from them their length is taken off.
+
+    Returns
+    -------
+    ndarray of shape (n markers,)
+        mm on the film, between centres.
+    """
+    points = np.array([marker.position_mm for marker in scene.markers], float).reshape(-1, 3)
+    least = np.full(len(points), np.inf)
+    for film in set(films.values()):
+        pitch = min(film.pitch_mm)
+        groups = [film.project(scene.foci_mm[focus], points) for focus in film.foci]
+        images = np.concatenate(groups)
+        marks = [(focus, mark) for focus in film.foci for mark in scene.marks_shown(focus)] if clear_of_marks else []
+        others = [film.project(scene.foci_mm[focus], np.array(mark.xyz, float)) for focus, mark in marks]
+        reach = np.array([1.2 * (mark.length or 0.0) for _, mark in marks])
+        gap = np.linalg.norm(images[:, None] - images, axis=-1) * pitch
+        np.fill_diagonal(gap, np.inf)
+        to_marks = np.linalg.norm(images[:, None] - np.reshape(others, (-1, 2)), axis=-1) * pitch - reach
+        rows, cols = film.shape
+        to_edge = np.min([images[:, 0], images[:, 1], cols - 1 - images[:, 0], rows - 1 - images[:, 1]], axis=0) * pitch
+        own = np.min([gap.min(1, initial=np.inf), to_marks.min(1, initial=np.inf), to_edge], axis=0)
+        least = np.minimum(least, own.reshape(len(groups), -1).min(0))
+    return least
+
+
 def place_objects(
     scene: Scene,
     films: Mapping[int, FilmPlane],
@@ -180,24 +216,23 @@ def place_objects(
     Parameters
     ----------
     scene : Scene
-        Its marks are in the way; its markers too.
-    films : dict of int to FilmPlane
-        The film of each focus; foci with the same film object share it.
+        Its marks and markers are in the way.
+    films : mapping of int to FilmPlane
+        As of :func:`clearance_mm`.
     count : int
     rng : numpy Generator
     diameter_mm : float
     gap_diameters : float
-        Least distance of the centres of two images, in magnified diameters.
+        Least :func:`clearance_mm`, in diameters of their images.
     box_mm : ndarray of shape (2, 3), optional
         Corners low and high; default :func:`object_box`.
     clear_of_marks : bool
-        Whether images of cage marks count too.
     segment : str
 
     Returns
     -------
     tuple of ObjectMarker
-        Numbered from 1.
+        The new ones, numbered from 1.
 
     Raises
     ------
@@ -205,27 +240,15 @@ def place_objects(
         If there is no room for so many.
     """
     low, high = object_box(scene.cage) if box_mm is None else np.asarray(box_mm, float)
-    taken: dict[int, list[tuple[Float, float]]] = {id(film): [] for film in films.values()}
-    for focus, film in films.items():
-        for mark in scene.marks_shown(focus) if clear_of_marks else ():
-            taken[id(film)].append((film.project(scene.foci_mm[focus], np.array(mark.xyz, float)), mark.length or 0.0))
-        for marker in scene.markers:
-            taken[id(film)].append((film.project(scene.foci_mm[focus], marker.position_mm), 0.0))
+    gap_mm = MAGNIFICATION * gap_diameters * diameter_mm
     placed: list[ObjectMarker] = []
-    for _ in range(1000 * count):
+    for _ in range(TRIES * count):
         if len(placed) == count:
             break
-        point = rng.uniform(low, high)
-        images = [(film, film.project(scene.foci_mm[focus], point)) for focus, film in films.items()]
-        gap_mm = 1.5 * gap_diameters * diameter_mm  # 1.5: magnified
-        clear = all(film.holds(px, gap_mm / min(film.pitch_mm)) for film, px in images)
-        for i, (film, px) in enumerate(images):
-            others = taken[id(film)] + [(other, 0.0) for other_film, other in images[:i] if other_film is film]
-            clear = clear and all(math.dist(px, other) * min(film.pitch_mm) > gap_mm + 1.2 * extra for other, extra in others)
-        if clear:
-            placed.append(ObjectMarker(segment, str(len(placed) + 1), point, diameter_mm))
-            for film, px in images:
-                taken[id(film)].append((px, 0.0))
+        candidate = ObjectMarker(segment, str(len(placed) + 1), rng.uniform(low, high), diameter_mm)
+        trial = replace(scene, markers=(*scene.markers, *placed, candidate))
+        if clearance_mm(trial, films, clear_of_marks=clear_of_marks)[-1] > gap_mm:
+            placed.append(candidate)
     if len(placed) < count:
         raise ValueError(f"no room for {count} markers {gap_diameters} diameters apart: enlarge box_mm or lower gap_diameters")
     return tuple(placed)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +14,9 @@ from rsa_vision.cages import Cage, load_cage
 from rsa_vision.types import Float
 from synthetic.anatomy import DISTRACTORS, blemishes, distractor_solids, tissue_with_bones
 from synthetic.film import FilmPlane, Pose, place_film
+from synthetic.motion import Motion, next_pose, share_out
 from synthetic.render import Beam, expose
-from synthetic.scanner import Response, Scanner, add_quantum_noise, digitise
+from synthetic.scanner import FilmCurve, Response, Scanner, add_quantum_noise, digitise
 from synthetic.scene import TANTALUM_PER_MM, ObjectMarker, Scene, missing_by_focus, object_box, place_objects, shift_foci
 from synthetic.truth import truth_tables
 from synthetic.write import Values, write_film, write_truth
@@ -69,6 +69,7 @@ def render_examination(
     exam: str = "202601010900",
     extension: str = "tif",
     n_objects: int = 13,
+    segments: Mapping[str, int] | None = None,
     object_diameter_mm: float = 0.8,
     markers: Sequence[ObjectMarker] | None = None,
     box_mm: Float | None = None,
@@ -113,6 +114,8 @@ def render_examination(
         Make the file names, ``SUBJECT_EXAM[_fK].EXT``.
     n_objects : int
         Balls of ``object_diameter_mm`` at random places (segment ``P``), unless ``markers`` says where they are.
+    segments : mapping of str to int, optional
+        Names of segments and the number of their balls, instead of ``n_objects``; the first lie lowest in y.
     markers : sequence of ObjectMarker, optional
     box_mm : ndarray of shape (2, 3), optional
         Where the object is; default :func:`synthetic.scene.object_box`.
@@ -157,7 +160,9 @@ def render_examination(
     sources = {k: np.asarray(v, float) for k, v in foci_mm.items()} if foci_mm else shift_foci(cage, focus_shift_mm, rng)
     numbers = tuple(sorted(sources))
     on_one = cage.film == "shared" if shared is None else shared
-    groups = {f"{subject}_{exam}.{extension}": numbers} if on_one else {f"{subject}_{exam}_f{k}.{extension}": (k,) for k in numbers}
+    groups: dict[str, tuple[int, ...]] = {f"{subject}_{exam}_f{k}.{extension}": (k,) for k in numbers}
+    if on_one:
+        groups = {f"{subject}_{exam}.{extension}": numbers}
     planes: dict[str, FilmPlane] = {}
     for name, group in groups.items():
         turn = float(rng.normal(0, 1.5)) if rotation_deg is None else rotation_deg
@@ -173,8 +178,10 @@ def render_examination(
     scene = Scene(cage, sources, **bare)
     if markers is None:
         film_of = {k: planes[name] for name, group in groups.items() for k in group}
+        count = sum(segments.values()) if segments else n_objects
         gaps: dict[str, Any] = {"gap_diameters": gap_diameters, "clear_of_marks": clear_of_marks, "box_mm": box}
-        markers = place_objects(scene, film_of, n_objects, rng=rng, diameter_mm=object_diameter_mm, **gaps)
+        markers = place_objects(scene, film_of, count, rng=rng, diameter_mm=object_diameter_mm, **gaps)
+        markers = share_out(markers, segments) if segments else markers
     solids = distractor_solids(kinds, scene, planes, box, rng)
     tissue = tissue_with_bones(box, rng) if bone else ()
     scene = Scene(cage, sources, tuple(markers), solids, tissue, **bare)
@@ -183,29 +190,11 @@ def render_examination(
     scanner = Scanner(response, bits, quanta, noise, blur_mm, scanner_noise, inverted)
     films: dict[str, Values] = {}
     for name, film in planes.items():
-        recorded = add_quantum_noise(expose(scene, film, beam, blur_mm=blur_mm, fine=fine), scanner, film, rng)
-        films[name] = digitise(recorded, scanner, rng, blemishes(kinds, film.shape, rng))
-    tables = truth_tables(scene, planes, subject, exam)
-    return RenderedExamination(films, groups, pitch, bits, scene, planes, tables["images"], tables["foci"], tables["markers"])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """A rigid motion: turn by ``rotation_deg`` about body-fixed x, y, z in this order through ``about_mm``, then shift."""
-
-    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    translation_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def matrix(self) -> Float:
-        """Return the rotation matrix, shape (3, 3)."""
-        product = np.eye(3)
-        for axis, degrees in enumerate(self.rotation_deg):
-            c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-            turn = np.eye(3)
-            i, j = (axis + 1) % 3, (axis + 2) % 3
-            turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
-            product = product @ turn
-        return product
+        exposure = expose(scene, film, beam, blur_mm=blur_mm, fine=fine)
+        scanner = replace(scanner, curve=FilmCurve().timed_for(exposure))
+        films[name] = digitise(add_quantum_noise(exposure, scanner, film, rng), scanner, rng, blemishes(kinds, film.shape, rng))
+    truth = truth_tables(scene, planes, subject, exam)
+    return RenderedExamination(films, groups, pitch, bits, scene, planes, truth["images"], truth["foci"], truth["markers"])
 
 
 def make_study(
@@ -255,17 +244,15 @@ def make_study(
     paths: list[Path] = []
     tables: dict[str, list[pl.DataFrame]] = {"images": [], "foci": [], "markers": [], "segments": []}
     for subject in subjects:
-        markers: tuple[ObjectMarker, ...] = ()
         for day in range(n_exams):
             named: dict[str, Any] = {"rng": rng, "subject": subject, "exam": f"2026{1 + day // 28:02d}{1 + day % 28:02d}0900"}
             if day == 0:
-                shot = render_examination(loaded, **named, **{"n_objects": sum(segments.values()), **options})
-                markers = _into_segments(shot.scene.markers, segments)
-                shot = _renamed(shot, markers, subject, named["exam"])
+                shot = render_examination(loaded, **named, **{"segments": segments, **options})
                 columns = ["subject", "segment", "marker", "x_mm", "y_mm", "z_mm"]
                 tables["segments"].append(shot.markers.select(columns))
             else:
-                markers = _moved(markers, motion, list(segments)[-1], box.mean(0), rng)
+                films = {focus: film for film in shot.planes.values() for focus in film.foci}
+                markers = next_pose(shot.scene, films, motion, list(segments)[-1], box.mean(0), rng)
                 shot = render_examination(loaded, **named, **{**options, "markers": markers})
             paths += shot.write(folder)
             for name in ("images", "foci", "markers"):
@@ -284,30 +271,3 @@ def make_study(
 
 def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
-
-
-def _into_segments(markers: Sequence[ObjectMarker], segments: Mapping[str, int]) -> tuple[ObjectMarker, ...]:
-    """Return the markers shared out to segments from low to high y, as bones lie along a limb."""
-    along = sorted(markers, key=lambda marker: float(marker.position_mm[1]))
-    names = [(segment, str(i + 1)) for segment, count in segments.items() for i in range(count)]
-    return tuple(
-        ObjectMarker(segment, number, marker.position_mm, marker.diameter_mm, marker.arms, marker.length_mm)
-        for (segment, number), marker in zip(names, along, strict=True)
-    )
-
-
-def _renamed(shot: RenderedExamination, markers: tuple[ObjectMarker, ...], subject: str, exam: str) -> RenderedExamination:
-    old = shot.scene
-    scene = Scene(old.cage, old.foci_mm, markers, old.clutter, old.tissue, old.missing_marks, old.foreign_marks, old.taper_mm)
-    tables = truth_tables(scene, shot.planes, subject, exam)
-    truth = (tables["images"], tables["foci"], tables["markers"])
-    return RenderedExamination(shot.films, shot.film_foci, shot.pitch_mm, shot.bits, scene, shot.planes, *truth)
-
-
-def _moved(
-    markers: Sequence[ObjectMarker], motion: Motion, segment: str, about_mm: Float, rng: np.random.Generator
-) -> tuple[ObjectMarker, ...]:
-    whole = Motion(*(tuple(float(x) for x in rng.normal(0, sd, 3)) for sd in (2.0, 2.0)))  # type: ignore[arg-type]  # three each
-    turn, shift = motion.matrix(), np.array(motion.translation_mm)
-    ahead = [marker.moved(turn, shift, about_mm) if marker.segment == segment else marker for marker in markers]
-    return tuple(marker.moved(whole.matrix(), np.array(whole.translation_mm), about_mm) for marker in ahead)

@@ -6,6 +6,7 @@ import datetime
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import imagecodecs
 import numpy as np
@@ -41,9 +42,10 @@ def write_film(path: Path, values: Values, *, bits: int, pitch_mm: tuple[float, 
     stored = np.asarray((2**bits - 1 - values).astype(values.dtype)) if white_is_zero else values
     kind = path.suffix.lower()
     if kind in (".tif", ".tiff"):
-        tags = {} if pitch_mm is None else {"resolution": (10 / pitch_mm[1], 10 / pitch_mm[0]), "resolutionunit": "CENTIMETER"}
-        packed = {"bitspersample": bits} if bits not in (8, 16) else {}
-        tifffile.imwrite(path, stored, photometric="miniswhite" if white_is_zero else "minisblack", metadata=None, **tags, **packed)
+        options: dict[str, Any] = {} if bits in (8, 16) else {"bitspersample": bits}
+        if pitch_mm is not None:
+            options |= {"resolution": (10 / pitch_mm[1], 10 / pitch_mm[0]), "resolutionunit": "CENTIMETER"}
+        tifffile.imwrite(path, stored, photometric="miniswhite" if white_is_zero else "minisblack", metadata=None, **options)
     elif kind == ".png" and not white_is_zero:
         path.write_bytes(_png(stored, pitch_mm))
     elif kind == ".dcm":
@@ -53,7 +55,7 @@ def write_film(path: Path, values: Values, *, bits: int, pitch_mm: tuple[float, 
 
 
 def _png(values: Values, pitch_mm: tuple[float, float] | None) -> bytes:
-    encoded: bytes = imagecodecs.png_encode(values)
+    encoded = bytes(imagecodecs.png_encode(values))
     if pitch_mm is None:
         return encoded
     chunk = b"pHYs" + struct.pack(">IIB", round(1000 / pitch_mm[1]), round(1000 / pitch_mm[0]), 1)  # pixels a metre: x, y
