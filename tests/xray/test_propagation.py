@@ -115,6 +115,34 @@ def test_errors_of_the_cage_are_carried_through(name: str) -> None:
     assert (np.einsum("nii->n", with_cage) > 1.5 * np.einsum("nii->n", exact)).all()
 
 
+@pytest.mark.parametrize("name", ["1A", "2"])
+def test_effect_of_every_cage_coordinate_against_differences(name: str) -> None:
+    rng = np.random.default_rng(29)
+    cage, foci, objects, _ = exposure(name, rng)
+    data = cage.model_dump()
+    for mark in data["mark"]:
+        mark["sd"] = (1.0, 2.0, 3.0)
+    cage = Cage.model_validate(data)
+    nominal = np.array([mark.xyz for mark in cage.mark])
+    films = {focus: film_from_plane(rng) for focus in foci}
+    step = 1e-3
+
+    def parameters(marks: np.ndarray) -> np.ndarray:
+        found = reconstruct(with_sd(expose(cage, foci, objects, films, marks), 1.0), cage, WIDE)
+        return np.array([np.append(focus.plane_from_film.ravel()[:8], focus.position_mm) for focus in found.foci])
+
+    stated_effects = [focus.cage_effect for focus in reconstruct(with_sd(expose(cage, foci, objects, films), 1.0), cage, WIDE).foci]
+    for column in range(nominal.size):
+        change = np.zeros(nominal.size)
+        change[column] = step
+        shift = change.reshape(-1, 3)
+        # the given coordinates are too large by `step` where the true mark lies that much lower
+        numeric = (parameters(nominal - shift) - parameters(nominal + shift)) / (2 * step) * (1.0, 2.0, 3.0)[column % 3]
+        for effect, expected in zip(stated_effects, numeric, strict=True):
+            scale = np.abs(effect).max(axis=1)
+            assert (np.abs(effect[:, column] - expected) / scale).max() < LINEAR
+
+
 @pytest.mark.parametrize("name", ["1A", "1B", "2"])
 def test_missing_covariances_are_estimated(name: str) -> None:
     rng = np.random.default_rng(24)
@@ -158,6 +186,9 @@ def test_understated_errors_are_inflated() -> None:
     shifted[points.role == "control"] += rng.normal(0, 3, ((points.role == "control").sum(), 2))
     found = reconstruct(with_sd(replace(points, position_px=shifted), 0.1), cage, WIDE)
     assert all(focus.fiducial_birge == 1 and focus.control_birge > 5 for focus in found.foci)
+    for focus, agreeing in zip(found.foci, reconstruct(with_sd(points, 0.1), cage, WIDE).foci, strict=True):
+        expected = np.diag(agreeing.covariance_mm2) * focus.control_birge**2
+        np.testing.assert_allclose(np.diag(focus.covariance_mm2), expected, rtol=0.1)  # other residuals, another Jacobian
 
 
 def test_selvik_formula_5_2() -> None:
