@@ -1,0 +1,50 @@
+"""Folders of radiographs in, three-dimensional marker coordinates with honest uncertainty out.
+
+Every command of ``rsa-vision`` is a function here: :func:`measure`, :func:`detect`, :func:`reconstruct`, :func:`report`, :func:`demo`.
+They are loaded when first used, so that ``import rsa_vision`` costs nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import Any, Final
+
+_COMMANDS: Final = frozenset({"measure", "detect", "reconstruct", "report", "demo"})
+_LAZY: Final = {
+    **dict.fromkeys(_COMMANDS, "rsa_vision.api"),
+    "Summary": "rsa_vision.api",
+    "Cage": "rsa_vision.cages",
+    "load_cage": "rsa_vision.cages",
+    "builtin_cages": "rsa_vision.cages",
+    "draw_cage": "rsa_vision.cage_drawing",
+    "Study": "rsa_vision.settings",
+    "load_study": "rsa_vision.settings",
+    "RsaError": "rsa_vision.errors",
+}
+
+__all__ = sorted(_LAZY)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("rsa_vision.provenance").version()
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LAZY[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
+
+
+class _Package(ModuleType):
+    """`detect` and `report` are commands and also modules: importing the modules must not hide the functions of the same names."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name not in _COMMANDS or not isinstance(value, ModuleType):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
