@@ -47,7 +47,7 @@ def pixels(path: Path, header: Header) -> tuple[Pixels, int]:
             table = page.colormap.T
             values, bits = through_palette(values, table if int(table.max()) > 255 else table.astype("uint8"), path), 16
             return to_grey(values, bits if values.dtype.itemsize == 2 else 8, path)
-        return to_grey(values, header.bits, path, inverted=page.photometric == _MINISWHITE)
+        return to_grey(values, header.bits, path, inverted=page.tags.valueof("PhotometricInterpretation") == _MINISWHITE)
 
 
 def _film_page(file: Any, path: Path) -> Any:
