@@ -20,7 +20,7 @@ IMPLICIT: Final = "1.2.840.10008.1.2"
 DEFLATED: Final = "1.2.840.10008.1.2.1.99"
 _NATIVE: Final = (IMPLICIT, "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.2")
 _JPEG: Final = tuple(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81))
-_JPEG_EXTENDED: Final = "1.2.840.10008.1.2.4.51"
+_JPEG_LS: Final = _JPEG[-2:]
 _JPEG2000: Final = tuple(f"1.2.840.10008.1.2.4.{number}" for number in (90, 91))
 _RLE: Final = "1.2.840.10008.1.2.5"
 _END_PADDING: Final = 16  # fragments are padded to even length; some writers pad to words
@@ -130,11 +130,18 @@ def _decoded(ds: Any, header: Header) -> NDArray[Any]:
             raise FilmError(f"{path}: the coded image is not of the size that the header tells; the file is damaged, export it again")
         if not ends(coded, stream.scan, _END_PADDING):
             raise FilmError(f"{path}: the coded image has no end; the file is truncated, copy it again")
-        if syntax == _JPEG_EXTENDED and stream.bits == 12:  # GDCM has no decoder for it
-            import imagecodecs
+        if header.samples == 1:
+            import imagecodecs  # GDCM takes three times its memory, and has no JPEG of 12 bits
 
-            extended: NDArray[Any] = imagecodecs.jpeg_decode(coded)
-            return extended
+            decode = (
+                imagecodecs.jpegls_decode
+                if syntax in _JPEG_LS
+                else imagecodecs.jpeg_decode
+                if syntax in _JPEG
+                else imagecodecs.jpeg2k_decode
+            )
+            grey: NDArray[Any] = decode(coded)
+            return grey
     values, _ = get_decoder(syntax).as_array(ds, index=0)
     decoded: NDArray[Any] = values
     return decoded
@@ -155,7 +162,7 @@ def _significant(raw: NDArray[Any], bits: int, shift: int, signed: bool, path: P
     sign = kind(2 ** (bits - 1))
     if int(values.max()) < int(sign):
         return values, max(bits - 1, MIN_BITS)
-    return np.bitwise_xor(values, sign), bits  # two's complement plus 2**(bits - 1)
+    return np.bitwise_xor(values, sign, out=values if values.flags.writeable else None), bits  # two's complement plus 2**(bits - 1)
 
 
 def _text(ds: Any, keywords: tuple[str, ...]) -> str:

@@ -101,6 +101,28 @@ def test_jpeg_12_bit_dicom(tmp_path: Path) -> None:
     assert np.abs(film.values.astype(int) - values)[1:].max() <= 60  # lossy, but of the same scale
 
 
+@pytest.mark.parametrize("predictor", range(1, 8))
+@pytest.mark.parametrize("bits", [12, 16])
+def test_jpeg_lossless_predictors(predictor: int, bits: int, tmp_path: Path) -> None:
+    """All predictors of ISO 10918-1 annex H; another decoder (GDCM) agrees."""
+    from pydicom import dcmread
+    from pydicom.pixels import get_decoder
+
+    values = films.radiograph(bits)
+    coded = bytes(imagecodecs.jpeg8_encode(values, lossless=True, predictor=predictor, bitspersample=bits))
+    path = films.dicom(tmp_path / "film", values, bits, syntax="1.2.840.10008.1.2.4.57", coded=coded)
+    np.testing.assert_array_equal(read_film(path).values, values)
+    other, _ = get_decoder("1.2.840.10008.1.2.4.57").as_array(dcmread(path), index=0)
+    np.testing.assert_array_equal(other, values)
+
+
+def test_signed_jpeg2000_dicom(tmp_path: Path) -> None:
+    values = films.radiograph(12).astype(np.int16) - 2048
+    coded = bytes(imagecodecs.jpeg2k_encode(values, level=0, codecformat="J2K", bitspersample=12, reversible=True))
+    film = read_film(films.dicom(tmp_path / "film", values, 12, syntax="1.2.840.10008.1.2.4.90", coded=coded))
+    np.testing.assert_array_equal(film.values, films.radiograph(12))
+
+
 def test_never_negative_signed_dicom(tmp_path: Path) -> None:
     values = films.radiograph(12)
     film = read_film(films.dicom(tmp_path / "film", values.astype(np.int16), 16))
