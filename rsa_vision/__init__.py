@@ -39,12 +39,18 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-class _Package(ModuleType):
-    """`detect` and `report` are commands and also modules: importing the modules must not hide the functions of the same names."""
+class _Command(ModuleType):
+    """A module that is also a command: `rsa_vision.detect` and `rsa_vision.report` stay callable when they have been imported."""
 
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return getattr(import_module("rsa_vision.api"), self.__name__.rpartition(".")[2])(*args, **kwargs)
+
+
+class _Package(ModuleType):
     def __setattr__(self, name: str, value: object) -> None:
-        if name not in _COMMANDS or not isinstance(value, ModuleType):
-            super().__setattr__(name, value)
+        if name in _COMMANDS and isinstance(value, ModuleType):
+            value.__class__ = _Command
+        super().__setattr__(name, value)
 
 
 sys.modules[__name__].__class__ = _Package

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from rsa_vision.types import MarkerImages
 
-PREVIEW_PX: Final = 1400  # longest side: marks of 5 px on a 3000 px film are still seen
+PREVIEW_PX: Final = 1300  # longest side: marks of 5 px on a 3000 px film are still seen
 DISPLAYED: Final = (0.2, 99.8)  # percentiles of the values that become black and white
-JPEG_QUALITY: Final = 82
+JPEG_QUALITY: Final = 72
 COLOUR: Final = {"ball": (80, 200, 255), "pin": (120, 255, 120), "tee": (255, 170, 60)}  # BGR
 
 Grey = NDArray[np.uint8]

@@ -17,9 +17,10 @@ from rsa_vision.store import picture_path, read_record, read_run, read_tables, r
 from rsa_vision.tables import Row
 from rsa_vision.types import Float
 
-COLOURS: Final = ("#4cc3ff", "#ffab40", "#c792ea", "#9ccc65")  # of the foci, on dark films; told apart by colour-blind readers too
+COLOURS: Final = ("#0a9bff", "#ff8000", "#b45cf0", "#4caf50")  # of the foci; the first two are told apart by colour-blind readers too
 MOST_PICTURED: Final = 60  # examinations with pictures; of more, those that are not ok come first
 SYMBOL_SHARE: Final = 1 / 110  # size of a symbol on the longest side of a film
+LABEL_SHARE: Final = 0.06  # of a film's width, for a label
 PLOT_PX: Final = (460, 330)
 LONGEST_ARROW: Final = 0.13  # of the plot's width
 
@@ -108,11 +109,11 @@ def _film(about: Mapping[str, Any], rows: Sequence[Row], picture: Path) -> dict[
         source = ""
     size = max(about["rows"], about["cols"]) * SYMBOL_SHARE
     order = {"unassigned": 0, "object": 1, "control": 2, "fiducial": 3}
-    symbols = [_symbol(row, size) for row in sorted(rows, key=lambda row: order[row["role"]]) if row["col_px"] is not None]
+    symbols = [_symbol(row, size, about["cols"]) for row in sorted(rows, key=lambda row: order[row["role"]]) if row["col_px"] is not None]
     return {**about, "source": source, "size": size, "symbols": symbols}
 
 
-def _symbol(row: Row, size: float) -> dict[str, Any]:
+def _symbol(row: Row, size: float, cols: int) -> dict[str, Any]:
     focus = row["focus"] or 0
     unassigned = row["role"] == "unassigned"
     reach = max(size, (row["radius_px"] or 0.0) * 1.6)
@@ -125,6 +126,10 @@ def _symbol(row: Row, size: float) -> dict[str, Any]:
         title += "; not used"
     if row["flags"]:
         title += f"; {row['flags']}"
+    # labels of the foci of a shared film stand on different sides, so that they do not cover each other, but on the film
+    side = -1 if focus % 2 == 0 else 1
+    if not LABEL_SHARE < row["col_px"] / cols < 1 - LABEL_SHARE:
+        side = 1 if row["col_px"] < cols / 2 else -1
     return {
         "x": row["col_px"],
         "y": row["row_px"],
@@ -133,8 +138,7 @@ def _symbol(row: Row, size: float) -> dict[str, Any]:
         "colour": "#ff4d6d" if unassigned else COLOURS[(focus - 1) % len(COLOURS)],
         "label": "" if unassigned else row["number"],
         "dashed": not unassigned and not row["used"],
-        # labels of the foci of a shared film stand on different sides, so that they do not cover each other
-        "side": -1 if focus % 2 == 0 else 1,
+        "side": side,
         "title": title,
     }
 
@@ -167,6 +171,7 @@ def _residual_plot(rows: Sequence[Row], focus: Row, cage: Cage) -> dict[str, Any
     lengths = np.linalg.norm(shift, axis=1)
     longest = float(lengths[used].max()) if used.any() else float(lengths.max())
     exaggeration = _round_down(LONGEST_ARROW * width / (max(longest, 1e-9) * scale))
+    bar_um = _round_down(0.25 * width / (exaggeration * scale) * 1000)
     middle = (low + high) / 2
     arrows = []
     for row, (u, v), (du, dv), length in zip(known, start, shift, lengths, strict=True):
@@ -178,7 +183,8 @@ def _residual_plot(rows: Sequence[Row], focus: Row, cage: Cage) -> dict[str, Any
         arrows[-1]["dashed"] = not row["used"]
     return {"focus": number, "arrows": arrows, "width": width, "height": height, "exaggeration": exaggeration} | {
         "colour": COLOURS[(number - 1) % len(COLOURS)],
-        "bar_px": 0.1 * exaggeration * scale,  # 100 um
+        "bar_um": bar_um,
+        "bar_px": bar_um / 1000 * exaggeration * scale,
     }
 
 
@@ -198,4 +204,4 @@ def _round_down(value: float) -> float:
 
 
 def _number(value: float | None, digits: int = 1) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+    return "–" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"  # + 0.0: no "-0"
