@@ -6,43 +6,25 @@ as a whole (:mod:`naming`). The best one is an answer only if it beats every dif
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rsa_vision.cages import Cage
-from rsa_vision.identify.film_model import FILM, GAP_MM, Scene, build_scene, plane_from_film
-from rsa_vision.identify.focus_search import NEAR_MM, find_foci
-from rsa_vision.identify.grids import find_grids
-from rsa_vision.identify.naming import (
-    FilmImages,
-    Naming,
-    angle_difference_deg,
-    doubtful_marks,
-    drop_gross_errors,
-    film_images,
-    name_marks,
-    on_bodies,
-    without,
-)
+from rsa_vision.identify.appearance import FilmImages, film_images, on_bodies
+from rsa_vision.identify.checks import are_different, far_penalty, impossible_stretch, what_contradicts, what_is_missing
+from rsa_vision.identify.doubts import doubtful_marks, drop_gross_errors, without
+from rsa_vision.identify.film_model import FILM, Scene, build_scene, plane_from_film
+from rsa_vision.identify.hypotheses import find_hypotheses
+from rsa_vision.identify.naming import Naming, name_marks
 from rsa_vision.settings import Limits
 from rsa_vision.types import Bool, Float, Int, MarkerImages
 
 TURN_DEG: Final = {"upright": 46.0, "mirrored": 46.0, "any": 180.0}  # largest angle between film and plane
-LARGEST_GAP_MM: Final = 45.0
-FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than allowed, to say `focus-far` rather than `not found`
-LOG_FAR: Final = 7.0  # a focus beyond the limit is that much less likely
 LOG_FALSE: Final = 16.0  # evidence against clutter that is demanded: one false cage in 1e7 films
-WEIGHED: Final = 10  # hypotheses that are fitted
-FOUND: Final = 0.5  # of the fiducial marks and of the control points of a focus must be named
-AGREEING: Final = 0.5  # of the named images must have the shape, and of the tees the direction, of their marks
-TURNED_DEG: Final = 25.0
-
-_Place = tuple[Float, Float, Float, Int]  # film from plane (A, b), focus, image of every mark
+LOG_MISLED: Final = 7.0  # evidence by which another orientation or focus than told must be better to say so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,121 +109,112 @@ def identify_cage(
         False, with its reasons, if the cage was not found.
     """
     limits = limits or Limits()
-    nominal = {f: np.asarray((foci_mm or {}).get(f, cage.foci[f]), float) for f in foci}
-    scene = build_scene(cage, tuple(foci), nominal)
-    usable = np.flatnonzero(np.isfinite(images.position_px).all(axis=1))
-    flip = np.array([-1.0 if orientation == "mirrored" else 1.0, 1.0])
-    to_film = np.diag([pitch_mm[1] * flip[0], -pitch_mm[0]])  # film mm from (col, row)
-    film = _film_images(images, usable, to_film, flip[0], film_shape[0] * film_shape[1] * pitch_mm[0] * pitch_mm[1])
-    turn_deg = TURN_DEG[orientation]
-    log_room = float(np.log(film_shape[0] * film_shape[1] * pitch_mm[0] * pitch_mm[1]) + np.log(2 * np.deg2rad(turn_deg)))
-    nothing = _Answer(cage, images, usable, scene, to_film)
-    shaped = np.isin(film.shape, [*np.unique(scene.shape[scene.own]), ""])
-    result = nothing.failed("too few images")
-    for subset in (np.flatnonzero(shaped), np.arange(len(usable)))[: 1 if shaped.all() else 2]:
-        hypotheses = _hypotheses(scene, film.xy_mm[subset], turn_deg, limits)
-        namings = [n for n in (name_marks(scene, start, film, log_room) for start in hypotheses) if n is not None]
-        result = _decide(nothing, scene, namings, film, limits, log_room)
-        if result:
-            break
+    told = _Reading(tuple(foci), orientation == "mirrored", TURN_DEG[orientation])
+    film = _Film(images, cage, pitch_mm, film_shape, {f: np.asarray(place, float) for f, place in {**cage.foci, **(foci_mm or {})}.items()})
+    shaped = np.isin(images.shape, [*{m.shape for m in cage.mark if set(m.foci) & set(foci)}, ""])
+    everything = np.arange(len(images))
+    result = _read(film, told, np.flatnonzero(shaped), limits)
+    if not result and not shaped.all():  # arms may be hidden: a tee is then taken for something else
+        result = _read(film, told, everything, limits)
+    return _doubt_what_was_told(film, told, result, limits) if result else result
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """What is taken for granted about a film."""
+
+    foci: tuple[int, ...]
+    mirrored: bool
+    turn_deg: float
+
+    def __str__(self) -> str:
+        focus = f"the film of focus {self.foci[0]}" if len(self.foci) == 1 else "the film"
+        return f"{focus}{', seen from behind' if self.mirrored else ''}{', turned' if self.turn_deg > 90 else ''}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Film:
+    """The images of a film and all that is known of it."""
+
+    images: MarkerImages
+    cage: Cage
+    pitch_mm: tuple[float, float]
+    shape: tuple[int, int]
+    foci_mm: Mapping[int, Float]
+
+    @property
+    def area_mm2(self) -> float:
+        return self.shape[0] * self.shape[1] * self.pitch_mm[0] * self.pitch_mm[1]
+
+    def log_room(self, reading: _Reading) -> float:
+        return float(np.log(self.area_mm2 * 2 * np.deg2rad(reading.turn_deg)))
+
+    def mm_from_px(self, reading: _Reading) -> Float:
+        """Film frame (x right, y up as seen from the focus, mm) from (col, row)."""
+        return np.diag([-self.pitch_mm[1] if reading.mirrored else self.pitch_mm[1], -self.pitch_mm[0]])
+
+    def usable(self) -> Int:
+        return np.flatnonzero(np.isfinite(self.images.position_px).all(axis=1))
+
+    def seen(self, reading: _Reading) -> FilmImages:
+        """Return the usable images in the film frame."""
+        images, to_mm = self.images.rows(self.usable()), self.mm_from_px(reading)
+        scale = float(self.pitch_mm[1])
+        covariance = to_mm @ images.covariance_px2 @ to_mm
+        covariance[~np.isfinite(covariance).all(axis=(1, 2))] = (0.2 * scale) ** 2 * np.eye(2)
+        covariance += (0.002 * scale) ** 2 * np.eye(2)  # a covariance of zero would outweigh all else
+        angle = np.deg2rad(images.angle_deg)
+        angle = np.arctan2(np.sin(angle), (-1 if reading.mirrored else 1) * np.cos(angle))
+        return film_images(images.position_px @ to_mm, covariance, images.shape, angle, images.radius_px * scale, self.area_mm2)
+
+
+def _read(film: _Film, reading: _Reading, subset: Int, limits: Limits) -> CageIdentification:
+    """Identify the cage as told, with grids and foci sought among some of the images."""
+    scene = build_scene(film.cage, reading.foci, film.foci_mm)
+    seen, log_room = film.seen(reading), film.log_room(reading)
+    among = np.isin(film.usable(), subset)
+    answer = _Answer(film.cage, film.images, film.usable(), scene, film.mm_from_px(reading))
+    if among.sum() < 6:
+        return answer.failed(f"{among.sum()} images only")
+    starts = find_hypotheses(scene, seen.xy_mm[among], reading.turn_deg, limits)
+    return _decide(answer, scene, [n for n in (name_marks(scene, start, seen, log_room) for start in starts) if n], seen, limits, log_room)
+
+
+def _doubt_what_was_told(film: _Film, told: _Reading, result: CageIdentification, limits: Limits) -> CageIdentification:
+    """Ask whether the marks of other planes tell of another orientation or focus than the user: a cage's own marks may be symmetric."""
+    if len(told.foci) > 1 or not result.foreign.size or all(set(told.foci) <= set(m.foci) for m in film.cage.mark):
+        return result
+    named = np.isin(film.usable(), [*result.assignments[told.foci[0]].values()])
+    for other in _other_readings(film.cage, told):
+        scene, seen, log_room = build_scene(film.cage, other.foci, film.foci_mm), film.seen(other), film.log_room(other)
+        for start in find_hypotheses(scene, seen.xy_mm[named], other.turn_deg, limits):
+            naming = name_marks(scene, start, seen, log_room)
+            if naming and naming.log_evidence - far_penalty(scene, naming, limits) > result.log_evidence + LOG_MISLED:
+                reasons = tuple(dict.fromkeys(("cage-ambiguous", *result.reasons)))
+                return replace(result, posterior=0.0, reasons=reasons, runner_up=f"the cage's other marks tell that this is {other}")
     return result
 
 
-def _film_images(images: MarkerImages, usable: Int, to_film: Float, flip: float, area_mm2: float) -> FilmImages:
-    xy = images.position_px[usable] @ to_film
-    covariance = to_film @ images.covariance_px2[usable] @ to_film
-    scale = float(np.abs(to_film[0, 0]))
-    sound = np.isfinite(covariance).all(axis=(1, 2))
-    covariance[~sound] = (0.2 * scale) ** 2 * np.eye(2)
-    covariance += (0.002 * scale) ** 2 * np.eye(2)  # a covariance of zero would outweigh all else
-    angle = np.deg2rad(images.angle_deg[usable])
-    angle = np.arctan2(np.sin(angle), flip * np.cos(angle))
-    return film_images(xy, covariance, images.shape[usable], angle, images.radius_px[usable] * scale, area_mm2)
-
-
-def _hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, limits: Limits) -> list[Float]:
-    """Return parameters of the film model to start from, the most promising first."""
-    reach = FOCUS_REACH * limits.focus_mm
-    base = max((float(np.hypot(*(a - b)[:2])) for a in scene.nominal_mm for b in scene.nominal_mm), default=0.0)
-    shift = LARGEST_GAP_MM * (base + 2 * limits.focus_mm) / (float(scene.nominal_mm[:, 2].min()) - limits.focus_mm)
-    options: list[list[_Place]] = []
-    grids: dict[bytes, list[tuple[Float, Float, int]]] = {}
-    tree = cKDTree(xy_mm)
-    for k in range(len(scene.foci)):
-        mine = scene.focus == k
-        fiducials = scene.xyz_mm[mine & scene.fiducial, :2]
-        controls = scene.xyz_mm[mine & scene.own & ~scene.fiducial]
-        key = fiducials.tobytes()
-        if key not in grids:
-            grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=len(scene.foci), largest_shift_mm=shift)
-        options.append(
-            [
-                (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))
-                for A, b, _ in grids[key]
-                for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach)
-            ]
-        )
-    # an image that two foci claim counts once: otherwise the marks of one focus would do for both
-    choices = np.array(list(product(*(range(len(o)) for o in options))), dtype=int).reshape(-1, len(options))
-    if not len(choices):
-        return []
-    union = np.zeros((len(choices), tree.n + 1), bool)
-    for k, some in enumerate(options):
-        explained = np.zeros((len(some), tree.n + 1), bool)
-        for row, place in zip(explained, some, strict=True):
-            row[place[3]] = True
-        union |= explained[choices[:, k]]
-    found: dict[bytes, Float] = {}
-    for index in np.argsort(-union[:, :-1].sum(axis=1), kind="stable"):
-        places = [options[k][choice] for k, choice in enumerate(choices[index])]
-        names = np.concatenate([place[3] for place in places]).tobytes()
-        if names not in found and (start := _start(scene, places)) is not None:
-            found[names] = start
-            if len(found) >= WEIGHED:
-                break
-    return list(found.values())
-
-
-def _seen(xyz_mm: Float, focus: Float, A: Float, b: Float, tree: cKDTree) -> Int:
-    """Return the image at the place where a focus would show each mark; one more than the last for none."""
-    place = xyz_mm[:, :2] + (xyz_mm[:, :2] - focus[:2]) * (xyz_mm[:, 2] / (focus[2] - xyz_mm[:, 2]))[:, None]
-    return np.asarray(tree.query(place @ A.T + b, distance_upper_bound=NEAR_MM)[1], dtype=np.int64)
-
-
-def _start(scene: Scene, choice: Sequence[_Place]) -> Float | None:
-    """Join a grid and a focus for every focus to one set of parameters; None if one film behind the plane cannot show them together."""
-    A = np.mean([a for a, *_ in choice], axis=0)
-    middle = [a @ scene.origin_mm + b for a, b, *_ in choice]
-    foci = np.array([focus for _, _, focus, _ in choice])
-    gap = GAP_MM
-    if len(choice) > 1:
-        if max(np.abs(a - A).max() for a, *_ in choice) > 0.02:
-            return None
-        # grids are shifted against each other by -gap times the difference of the foci over their heights
-        towards = (foci[:, :2] - scene.origin_mm) / foci[:, 2:]
-        towards = towards - towards.mean(axis=0)
-        order = (foci[:, :2] - foci[:, :2].mean(axis=0)) * (scene.nominal_mm[:, :2] - scene.nominal_mm[:, :2].mean(axis=0))
-        if order.sum() <= 0:
-            return None  # the names of the foci are exchanged
-        shifts = (np.array(middle) - np.mean(middle, axis=0)) @ np.linalg.inv(A).T
-        gap = -float((shifts * towards).sum() / (towards**2).sum())
-        if not -1.0 < gap < LARGEST_GAP_MM or np.abs(shifts + gap * towards).max() > 1.0:
-            return None
-    away = (scene.origin_mm - foci[:, :2]) * (gap / foci[:, 2:])
-    stretch = 1 + gap / foci[:, 2].mean()
-    b = np.mean([m - A @ a / stretch for m, a in zip(middle, away, strict=True)], axis=0)
-    return np.concatenate([(A / stretch).ravel(), b, [gap, 0, 0], foci.ravel()])
+def _other_readings(cage: Cage, told: _Reading) -> Iterator[_Reading]:
+    for focus in sorted(cage.foci):
+        for mirrored in (told.mirrored, not told.mirrored):
+            reading = _Reading((focus,), mirrored, 180.0)
+            if reading != told:
+                yield reading
 
 
 def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImages, limits: Limits, log_room: float) -> CageIdentification:
     if not namings:
         return answer.failed("no grid of fiducial marks with control points")
+    possible = [n for n in namings if not impossible_stretch(n)]
+    if not possible:
+        return answer.failed(impossible_stretch(namings[0]))
     # gross errors are left out before hypotheses are compared: a single wrong image must not decide
     limit_mm = limits.fiducial_um / 1000
-    cleaned = [drop_gross_errors(scene, n, film, limit_mm, log_room) for n in namings]
-    scored = sorted(((n.log_evidence - _far(scene, n, limits), n) for n in cleaned), key=lambda item: -item[0])
+    cleaned = [drop_gross_errors(scene, n, film, limit_mm, log_room) for n in possible]
+    scored = sorted(((n.log_evidence - far_penalty(scene, n, limits), n) for n in cleaned), key=lambda item: -item[0])
     score, best = scored[0]
-    rivals = [(s, n) for s, n in scored[1:] if _different(scene, best, n)]
+    rivals = [(s, n) for s, n in scored[1:] if are_different(scene, best, n)]
     log_odds = float(np.log(limits.posterior / (1 - limits.posterior)))
     doubtful, decisive = doubtful_marks(scene, best, film, log_odds)
     dropped = list(best.dropped)
@@ -252,10 +225,10 @@ def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImag
             return answer.failed("too few marks without doubt")
         best = drop_gross_errors(scene, replace(smaller, dropped=tuple(dropped)), film, limit_mm, log_room)
         decisive = doubtful_marks(scene, best, film, log_odds)[1]
-    missing = _missing(scene, best)
+    missing = what_is_missing(scene, best)
     if missing:
         return answer.failed(missing)
-    against = _against(scene, best, film)
+    against = what_contradicts(scene, best, film)
     if against:
         return answer.failed(against)
     if score < LOG_FALSE:
@@ -266,43 +239,6 @@ def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImag
     if posterior < limits.posterior or any(abs(s - score) < log_odds for s, _ in rivals):
         reasons.append("cage-ambiguous")
     return answer.found(best, film, posterior, reasons, limits, rivals[0] if rivals else None, score)
-
-
-def _far(scene: Scene, naming: Naming, limits: Limits) -> float:
-    places = naming.fit.parameters[FILM:].reshape(-1, 3)
-    return LOG_FAR * float((np.linalg.norm(places - scene.nominal_mm, axis=1) > limits.focus_mm).sum())
-
-
-def _different(scene: Scene, a: Naming, b: Naming) -> bool:
-    """Return whether a mark has different images in two namings."""
-    both = scene.own & (a.image >= 0) & (b.image >= 0)
-    same = (a.image[both] == b.image[both]).sum()
-    return bool(same < both.sum() or same < 0.5 * (scene.own & (b.image >= 0)).sum())
-
-
-def _missing(scene: Scene, naming: Naming) -> str:
-    for k, focus in enumerate(scene.foci):
-        for fiducial, least, name in ((True, 4, "fiducial marks"), (False, 2, "control points")):
-            wanted = scene.own & (scene.focus == k) & (scene.fiducial == fiducial)
-            seen = int((naming.image[wanted] >= 0).sum())
-            if seen < max(least, np.ceil(FOUND * wanted.sum())):
-                return f"only {seen} of {wanted.sum()} {name} of focus {focus}"
-    return ""
-
-
-def _against(scene: Scene, naming: Naming, film: FilmImages) -> str:
-    """Return what of the look of the images contradicts the cage; single ones may be hidden in part, most may not."""
-    rows = naming.rows[scene.own[naming.rows]]
-    chosen = naming.image[rows]
-    known = film.shape[chosen] != ""
-    right = film.shape[chosen] == scene.shape[rows]
-    if known.any() and right[known].mean() < AGREEING:
-        return f"{(~right[known]).sum()} of {known.sum()} images have another shape than their marks"
-    turned = angle_difference_deg(scene, naming.fit.parameters, film)[rows, chosen]
-    turned = turned[np.isfinite(turned)]
-    if len(turned) and (np.abs(turned) < TURNED_DEG).mean() < AGREEING:
-        return f"{(np.abs(turned) >= TURNED_DEG).sum()} of {len(turned)} images point in another direction than their marks"
-    return ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

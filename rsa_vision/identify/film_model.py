@@ -10,6 +10,7 @@ Parameters: A00, A01, A10, A11, bx, by (film from plane), gap, tilt about v and 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -77,7 +78,7 @@ class Scene:
         return lab
 
 
-def build_scene(cage: Cage, foci: tuple[int, ...], foci_mm: dict[int, Float]) -> Scene:
+def build_scene(cage: Cage, foci: tuple[int, ...], foci_mm: Mapping[int, Float]) -> Scene:
     """List what may be seen on a film that the given foci share.
 
     Parameters
@@ -85,7 +86,7 @@ def build_scene(cage: Cage, foci: tuple[int, ...], foci_mm: dict[int, Float]) ->
     cage : Cage
     foci : tuple of int
         The foci of this film; all have the same plane.
-    foci_mm : dict
+    foci_mm : mapping
         Nominal foci in the laboratory frame.
 
     Returns

@@ -66,7 +66,8 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: np.random.Genera
     origin, (u, v) = np.array(plane.origin, float), np.array([plane.u, plane.v], float)
     normal = np.cross(u, v)
     middle = np.mean([m.xyz for m in cage.mark if m.role == "fiducial" and foci[0] in m.foci], axis=0)
-    film_normal = normal - e.tilt[0] * u - e.tilt[1] * v
+    steep = 0.5 * e.gap_mm / 250  # a film lies behind its plane everywhere
+    film_normal = normal - np.clip(e.tilt[0], -steep, steep) * u - np.clip(e.tilt[1], -steep, steep) * v
     film_origin = middle - e.gap_mm * normal
     cols, rows = round(e.size_mm[0] / e.pitch_mm), round(e.size_mm[1] / e.pitch_mm)
     turn = np.deg2rad(e.turn_deg)
@@ -129,10 +130,18 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: np.random.Genera
         kind = str(rng.choice(["ball", "pin", "tee"], p=e.clutter_shapes))
         at = rng.uniform([0, 0], [cols, rows])
         add(at, kind, np.nan if kind == "ball" else rng.uniform(-180, 180), rng.uniform(2, 8), ("false", 0, "", 0))
-    position = np.array(px).reshape(-1, 2)
-    sd = e.noise_px * rng.uniform(0.7, 1.5, len(position))
+    position, sd, named = np.array(px).reshape(-1, 2), e.noise_px * rng.uniform(0.7, 1.5, len(px)), list(source)
+    keep = np.ones(len(px), bool)
+    for i in range(len(px)):  # what lies too close is one image, what overlaps is found less well
+        for j in np.flatnonzero(keep & (np.arange(len(px)) < i) & (np.array(shape) == shape[i])):
+            apart, width = np.hypot(*(position[i] - position[j])), min(radius[i], radius[j])
+            if apart < 0.7 * width:
+                keep[i], position[j], sd[j] = False, (position[i] + position[j]) / 2, max(sd[j], apart / 4)
+                named[j] = (*named[j], source[i])
+                break
+            if apart < 2 * width:
+                sd[i], sd[j] = 2 * sd[i], 2 * sd[j]
     position = position + rng.normal(size=position.shape) * sd[:, None] + rng.normal(size=position.shape) * e.slack_mm / e.pitch_mm
-    order = rng.permutation(len(position))
     covariance = (sd**2)[:, None, None] * np.eye(2)
     filled = np.full(len(position), 0.3)
     images = MarkerImages(
@@ -145,7 +154,8 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: np.random.Genera
         filled * 100,
         np.zeros(len(position), np.int64),
     )
-    return FilmTruth(images.rows(order), (rows, cols), [source[i] for i in order])
+    order = rng.permutation(np.flatnonzero(keep))
+    return FilmTruth(images.rows(order), (rows, cols), [named[i] for i in order])
 
 
 def random_exposure(rng: np.random.Generator, cage: Cage, **fixed: object) -> Exposure:

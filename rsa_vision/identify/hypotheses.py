@@ -1,0 +1,96 @@
+"""Hypotheses about a film: every way to place its fiducial grids and foci that explains many images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rsa_vision.identify.film_model import GAP_MM, Scene
+from rsa_vision.identify.focus_search import NEAR_MM, find_foci
+from rsa_vision.identify.grids import find_grids
+from rsa_vision.settings import Limits
+from rsa_vision.types import Float, Int
+
+LARGEST_GAP_MM: Final = 45.0
+FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than allowed, to say `focus-far` rather than `not found`
+WEIGHED: Final = 10  # hypotheses that are fitted
+
+_Place = tuple[Float, Float, Float, Int]  # film from plane (A, b), focus, image of every mark
+
+
+def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, limits: Limits) -> list[Float]:
+    """Return parameters of the film model to start from, the most promising first."""
+    reach = FOCUS_REACH * limits.focus_mm
+    base = max((float(np.hypot(*(a - b)[:2])) for a in scene.nominal_mm for b in scene.nominal_mm), default=0.0)
+    shift = LARGEST_GAP_MM * (base + 2 * limits.focus_mm) / (float(scene.nominal_mm[:, 2].min()) - limits.focus_mm)
+    options: list[list[_Place]] = []
+    grids: dict[bytes, list[tuple[Float, Float, int]]] = {}
+    tree = cKDTree(xy_mm)
+    for k in range(len(scene.foci)):
+        mine = scene.focus == k
+        fiducials = scene.xyz_mm[mine & scene.fiducial, :2]
+        controls = scene.xyz_mm[mine & scene.own & ~scene.fiducial]
+        key = fiducials.tobytes()
+        if key not in grids:
+            grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=len(scene.foci), largest_shift_mm=shift)
+        options.append(
+            [
+                (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))
+                for A, b, _ in grids[key]
+                for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach)
+            ]
+        )
+    # an image that two foci claim counts once: otherwise the marks of one focus would do for both
+    choices = np.array(list(product(*(range(len(o)) for o in options))), dtype=int).reshape(-1, len(options))
+    if not len(choices):
+        return []
+    union = np.zeros((len(choices), tree.n + 1), bool)
+    for k, some in enumerate(options):
+        explained = np.zeros((len(some), tree.n + 1), bool)
+        for row, place in zip(explained, some, strict=True):
+            row[place[3]] = True
+        union |= explained[choices[:, k]]
+    found: dict[bytes, Float] = {}
+    for index in np.argsort(-union[:, :-1].sum(axis=1), kind="stable"):
+        places = [options[k][choice] for k, choice in enumerate(choices[index])]
+        names = np.concatenate([place[3] for place in places]).tobytes()
+        if names not in found and (start := _start(scene, places)) is not None:
+            found[names] = start
+            if len(found) >= WEIGHED:
+                break
+    return list(found.values())
+
+
+def _seen(xyz_mm: Float, focus: Float, A: Float, b: Float, tree: cKDTree) -> Int:
+    """Return the image at the place where a focus would show each mark; one more than the last for none."""
+    place = xyz_mm[:, :2] + (xyz_mm[:, :2] - focus[:2]) * (xyz_mm[:, 2] / (focus[2] - xyz_mm[:, 2]))[:, None]
+    return np.asarray(tree.query(place @ A.T + b, distance_upper_bound=NEAR_MM)[1], dtype=np.int64)
+
+
+def _start(scene: Scene, choice: Sequence[_Place]) -> Float | None:
+    """Join a grid and a focus for every focus to one set of parameters; None if one film behind the plane cannot show them together."""
+    A = np.mean([a for a, *_ in choice], axis=0)
+    middle = [a @ scene.origin_mm + b for a, b, *_ in choice]
+    foci = np.array([focus for _, _, focus, _ in choice])
+    gap = GAP_MM
+    if len(choice) > 1:
+        if max(np.abs(a - A).max() for a, *_ in choice) > 0.02:
+            return None
+        # grids are shifted against each other by -gap times the difference of the foci over their heights
+        towards = (foci[:, :2] - scene.origin_mm) / foci[:, 2:]
+        towards = towards - towards.mean(axis=0)
+        order = (foci[:, :2] - foci[:, :2].mean(axis=0)) * (scene.nominal_mm[:, :2] - scene.nominal_mm[:, :2].mean(axis=0))
+        if order.sum() <= 0:
+            return None  # the names of the foci are exchanged
+        shifts = (np.array(middle) - np.mean(middle, axis=0)) @ np.linalg.inv(A).T
+        gap = -float((shifts * towards).sum() / (towards**2).sum())
+        if not -1.0 < gap < LARGEST_GAP_MM or np.abs(shifts + gap * towards).max() > 1.0:
+            return None
+    away = (scene.origin_mm - foci[:, :2]) * (gap / foci[:, 2:])
+    stretch = 1 + gap / foci[:, 2].mean()
+    b = np.mean([m - A @ a / stretch for m, a in zip(middle, away, strict=True)], axis=0)
+    return np.concatenate([(A / stretch).ravel(), b, [gap, 0, 0], foci.ravel()])
