@@ -87,7 +87,7 @@ def chord_pin(origin: Float, direction: Float, tip: Float, axis: Float, length: 
     o_axis, d_axis = ox * axis[0] + oy * axis[1] + oz * axis[2], dx * axis[0] + dy * axis[1] + dz * axis[2]
     o_norm2 = ox * ox + oy * oy + oz * oz
 
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ends = (-o_axis / d_axis, (length - o_axis) / d_axis)
     low, high = np.minimum(*ends), np.maximum(*ends)
     parallel = d_axis == 0.0
@@ -109,7 +109,7 @@ def _clip(low: Float, high: Float, a: Float, b: Float, c: Float, forward: Float)
     disc = b * b - a * c
     root = np.sqrt(np.maximum(disc, 0.0))
     q = -(b + np.copysign(root, b))
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         t1, t2 = q / a, np.where(q == 0.0, 0.0, c / q)
     first, last = np.fmin(t1, t2), np.fmax(t1, t2)
     miss: Bool = (a > 0) & (disc <= 0)

@@ -79,7 +79,7 @@ class Exposure:
     blurred: Image
 
 
-def expose(scene: Scene, film: FilmPlane, beam: Beam, *, blur_mm: float = 0.1, fine: int = 4) -> Exposure:
+def expose(scene: Scene, film: FilmPlane, beam: Beam, *, blur_mm: float = 0.1, fine: int = 5) -> Exposure:
     """Expose a film by each of its foci in turn, each giving an equal part of the exposure.
 
     Parameters
@@ -164,16 +164,17 @@ def _fine_grid(first: int, stop: int, fine: int) -> Float:
 
 def _bin(pixels: Int, samples: Float, sigma: float, fine: int) -> Float:
     """Return the matrices, shape (k, pixels, samples), that blur fine samples and integrate them over pixels."""
-    distance = samples[:, None, :] - pixels[None, :, None]
-    if sigma == 0.0:
-        return np.asarray(np.clip(0.5 + (0.5 - np.abs(distance)) * fine, 0.0, 1.0) / fine)
-    return np.asarray((ndtr((distance + 0.5) / sigma) - ndtr((distance - 0.5) / sigma)) / fine)
+    edges = np.append(pixels, pixels[-1] + 1) - 0.5
+    beyond = samples[:, None, :] - edges[:, None]
+    before = ndtr(beyond / sigma) if sigma else np.clip(0.5 + beyond * fine, 0.0, 1.0)  # a sample stands for 1 / fine of a pixel
+    return np.asarray((before[:, :-1] - before[:, 1:]) / fine)
 
 
 def _transmission(parts: dict[Solid, tuple[slice, slice]], film: FilmPlane, sources: Float, fine_row: Float, fine_col: Float) -> Float:
     """Return the transmission, shape (k, rows, cols), of solids for a grid of rays from each of k sources; each shades only its part."""
-    grid = np.stack(np.broadcast_arrays(fine_col[:, None, :], fine_row[:, :, None]), -1)
-    ray = np.moveaxis(film.lab_from_pixel(grid), -1, 0) - sources.T[:, :, None, None]
+    corner, right, below = film.lab_from_pixel(np.array([[0, 0], [1, 0], [0, 1]]))
+    by_col, by_row, start = (vector[:, None, None, None] for vector in (right - corner, below - corner, corner))
+    ray = start - sources.T[:, :, None, None] + by_col * fine_col[:, None, :] + by_row * fine_row[:, :, None]
     origin = sources.T[:, :, None, None]
     depth = np.zeros(ray.shape[1:])
     for solid, (rows, cols) in parts.items():

@@ -101,7 +101,7 @@ def render_examination(
     foreign_marks: bool = True,
     taper_mm: float | None = None,
     attenuation_per_mm: float = TANTALUM_PER_MM,
-    fine: int = 4,
+    fine: int = 5,
 ) -> RenderedExamination:
     """Render one examination.
 
