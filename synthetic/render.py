@@ -142,7 +142,7 @@ def _shadows(scene: Scene, film: FilmPlane, focus: int, beam: Beam, blur_mm: flo
     reach = [math.ceil(5 * sigma) for sigma in sigma_px]
     jitter = (np.arange(1, len(weights) + 1)[:, None] * (0.7548776662466927, 0.5698402909980532)) % 1.0  # another grid for every source
 
-    for (r0, r1, c0, c1), members in _tiles(solids, film, sources).items():
+    for (r0, r1, c0, c1), members in _tiles(solids, film, sources, reach).items():
         fine = rays if any(solids[i].radius < LARGE_MM for i in members) else 1
         fine_row, fine_col = (_fine_grid(a, b, fine) + (jitter[:, i, None] - 0.5) / fine for i, (a, b) in enumerate(((r0, r1), (c0, c1))))
         inside = {index: (slice((a - r0) * fine, (b - r0) * fine), slice((c - c0) * fine, (d - c0) * fine))
@@ -152,6 +152,8 @@ def _shadows(scene: Scene, film: FilmPlane, focus: int, beam: Beam, blur_mm: flo
         for out, sigma, halo in ((lost_incident, (0.0, 0.0), (0, 0)), (lost_blurred, sigma_px, reach)):
             from_row, from_col = (max(a - h, 0) for a, h in zip((r0, c0), halo, strict=True))
             to_row, to_col = (min(b + h, size) for b, h, size in zip((r1, c1), halo, film.shape, strict=True))
+            if from_row >= to_row or from_col >= to_col:
+                continue
             across = _bin(np.arange(from_row, to_row), fine_row, sigma[0], fine)
             along = _bin(np.arange(from_col, to_col), fine_col, sigma[1], fine)
             out[from_row:to_row, from_col:to_col] += (across @ lost @ along.transpose(0, 2, 1)).sum(0)
@@ -190,12 +192,16 @@ def _transmission(parts: dict[Solid, tuple[slice, slice]], film: FilmPlane, sour
 Box = tuple[int, int, int, int]  # row start, row stop, col start, col stop
 
 
-def _tiles(solids: list[Solid], film: FilmPlane, sources: Float) -> dict[Box, dict[int, Box]]:
+def _tiles(solids: list[Solid], film: FilmPlane, sources: Float, reach: list[int]) -> dict[Box, dict[int, Box]]:
     """Return the boxes of pixels to ray-trace, which do not overlap, with the solids that may shade each and where in it."""
+    margin = np.array(reach[::-1])  # shadows beside the film are blurred into it
+    first, last = -margin, margin + film.shape[::-1]
     touched: dict[tuple[int, int], dict[int, Box]] = {}
     for index, solid in enumerate(solids):
         for low, high in _footprints(solid, film, sources):
-            (c0, r0), (c1, r1) = np.maximum(low, 0).tolist(), np.minimum(high, (film.shape[1], film.shape[0])).tolist()
+            (c0, r0), (c1, r1) = np.maximum(low, first).tolist(), np.minimum(high, last).tolist()
+            if r0 >= r1 or c0 >= c1:
+                continue
             for row in range(r0 // TILE_PX, -(-r1 // TILE_PX)):
                 for col in range(c0 // TILE_PX, -(-c1 // TILE_PX)):
                     part = (max(r0, row * TILE_PX), min(r1, (row + 1) * TILE_PX), max(c0, col * TILE_PX), min(c1, (col + 1) * TILE_PX))

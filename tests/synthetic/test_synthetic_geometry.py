@@ -1,5 +1,7 @@
 """Films rendered without noise lie where the truth says, for every pose and cage."""
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -10,6 +12,7 @@ from synthetic.render import Beam, expose
 from synthetic.scene import ObjectMarker, Scene
 from synthetic.study import render_examination
 
+CUT = 2e-6  # of the exposure: 5 sigma of blur are kept
 CENTROID_PX = 0.002  # of a noiseless ball: sampling of the rays, and the bias of a ball's image under perspective (below 0.0005 px)
 
 
@@ -53,6 +56,21 @@ def test_projection_is_the_centroid_of_the_ball(name, focus, pose):
         position = film.project(foci[focus], marker.position_mm)
         errors.append(centroid(picture, position, 14) - position)
     assert np.abs(errors).max() < CENTROID_PX
+
+
+@pytest.mark.parametrize("past_edge_px", [-6, -2, 0, 2, 6, 15, 40])
+def test_shadows_are_cut_at_the_edge_of_the_film(past_edge_px):
+    """A small film gets the same exposure as that part of a larger one (the width is no multiple of a tile's)."""
+    cage = load_cage("2")
+    foci = {k: np.array(v, float) for k, v in cage.foci.items()}
+    ball = ObjectMarker("P", "1", np.array([0.0, 100.0, 50.0]), 0.8)
+    scene = Scene(cage.model_copy(update={"mark": ()}), foci, (ball,))
+    large = place_film(cage, foci, (1,), size_mm=(40, 40))
+    position = large.project(foci[1], ball.position_mm)
+    whole = expose(scene, large, Beam(falloff=False)).blurred
+    cols = int(position[0]) - past_edge_px
+    small = expose(scene, replace(large, shape=(large.shape[0], cols)), Beam(falloff=False)).blurred
+    assert small == pytest.approx(whole[:, :cols], abs=CUT)
 
 
 def test_double_peaked_spot_keeps_its_centroid_and_widens_the_image():
