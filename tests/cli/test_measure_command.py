@@ -1,0 +1,226 @@
+"""`rsa-vision measure` as a user meets it; marker images come from the truth."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.spatial import cKDTree
+
+import rsa_vision
+from rsa_vision.cli import run_app
+from rsa_vision.flags import REASONS
+from synthetic.study import RenderedExamination
+
+FIRST, SECOND = "S01_202601010900", "S01_202602010900"
+TEXT = {"exam": pl.String, "number": pl.String, "marker": pl.String, "flags": pl.String, "reasons": pl.String}
+SIGMAS = 5.0  # of coordinates from their truth; 36 values
+Counter = Callable[[], int]
+pytestmark = pytest.mark.usefixtures("count_detections")
+
+
+def read(out: Path, table: str) -> pl.DataFrame:
+    return pl.read_csv(out / f"{table}.csv", schema_overrides=TEXT)
+
+
+def statuses(out: Path) -> dict[str, tuple[str, str]]:
+    rows = read(out, "exams").fill_null("")
+    return {f"{r['subject']}_{r['exam']}".rstrip("_"): (r["status"], r["reasons"]) for r in rows.to_dicts()}
+
+
+def test_markers_of_every_examination_at_their_true_places(folder: Path, tmp_path: Path, exams: list[RenderedExamination]) -> None:
+    out = tmp_path / "out"
+    assert run_app(["measure", str(folder), "-o", str(out)]) == 0
+    assert statuses(out) == {FIRST: ("ok", ""), SECOND: ("ok", "")}
+    markers = read(out, "markers")
+    for exam, rendered in zip(("202601010900", "202602010900"), exams, strict=True):
+        found = markers.filter(pl.col("exam") == exam)
+        truth = rendered.markers.select("x_mm", "y_mm", "z_mm").to_numpy()
+        place = found.select("x_mm", "y_mm", "z_mm").to_numpy()
+        sd = found.select("sd_x_mm", "sd_y_mm", "sd_z_mm").to_numpy()
+        nearest = cKDTree(truth).query(place)[1]
+        assert sorted(nearest.tolist()) == list(range(len(truth)))
+        assert np.abs((place - truth[nearest]) / sd).max() < SIGMAS
+        assert sd.max() < 0.05
+        assert found["marker"].to_list() == [f"P{k + 1:02d}" for k in range(len(truth))]
+        assert found["segment"].fill_null("").unique().to_list() == [""]
+
+
+def test_every_image_stands_in_the_table_with_its_names(folder: Path, tmp_path: Path, exams: list[RenderedExamination]) -> None:
+    out = tmp_path / "out"
+    run_app(["measure", str(folder), "-o", str(out)])
+    images = read(out, "images")
+    for name, rendered in ((n, e) for e in exams for n in e.films):
+        found = images.filter((pl.col("file") == name) & pl.col("role").is_in(["fiducial", "control"]))
+        truth = rendered.images.filter((pl.col("file") == name) & pl.col("role").is_in(["fiducial", "control"]))
+        keys = ["focus", "role", "number"]
+        joined = truth.join(found, on=keys, how="left", suffix="_found")
+        assert len(joined) == len(truth) == len(found)
+        off = joined.select((pl.col("col_px") - pl.col("col_px_found")).abs().max(), (pl.col("row_px") - pl.col("row_px_found")).abs().max())
+        assert max(off.row(0)) < 0.2
+        assert len(images.filter(pl.col("file") == name)) == len(rendered.images.filter(pl.col("file") == name))
+
+
+def test_run_json_is_enough_to_run_again(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run_app(["measure", str(folder), "-o", str(out), "--response", "density"])
+    run = json.loads((out / "run.json").read_text())
+    assert run["settings"]["cage"] == "2"
+    assert run["settings"]["response"] == "density"
+    assert run["cage"]["sha256"] == rsa_vision.load_cage("2").sha256
+    assert rsa_vision.Cage.model_validate(run["cage"]["content"]) == rsa_vision.load_cage("2")
+    assert {Path(i["path"]).name: i["sha256"] for i in run["inputs"]} == {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("*.tif")
+    }
+    assert run["start"] < run["end"]
+    assert {"rsa_vision", "host", "python"} <= set(run)
+
+
+def test_finished_examinations_are_kept_until_something_changes(folder: Path, tmp_path: Path, count_detections: Counter) -> None:
+    out = tmp_path / "out"
+    command = ["measure", str(folder), "-o", str(out)]
+    assert run_app(command) == 0
+    before = {path.name: path.read_bytes() for path in out.glob("*.csv")}
+    assert count_detections() == 4
+    assert run_app(command) == 0
+    assert count_detections() == 4
+    assert {path.name: path.read_bytes() for path in out.glob("*.csv")} == before
+    (out / "exams" / f"{SECOND}.json").unlink()  # as if it had been stopped there
+    assert run_app(command) == 0
+    assert count_detections() == 6
+    assert run_app([*command, "--redo"]) == 0
+    assert count_detections() == 10
+    assert run_app([*command, "--temperature-c", "24"]) == 0
+    assert count_detections() == 14
+    (folder / f"{FIRST}_f1.tif").write_bytes((folder / f"{SECOND}_f1.tif").read_bytes())
+    assert run_app([*command, "--temperature-c", "24"]) == 1
+    assert count_detections() == 16
+    assert statuses(out)[FIRST][0] != "ok"
+
+
+def test_one_bad_film_never_stops_a_run(folder: Path, tmp_path: Path, other_film: Callable[[str, str], Path]) -> None:
+    film = (folder / f"{FIRST}_f1.tif").read_bytes()
+    for subject, bad in {"EMPTY": b"", "TRUNC": film[: len(film) // 2], "TEXT": b"no film" * 100}.items():
+        (folder / f"{subject}_1_f1.tif").write_bytes(bad)
+        other_film(f"{FIRST}_f2.tif", f"{subject}_1_f2.tif")
+    other_film(f"{FIRST}_f1.tif", "ALONE_1_f1.tif")
+    other_film(f"{FIRST}_f1.tif", "nameless.tif")
+    out = tmp_path / "out"
+    assert run_app(["measure", str(folder), "-o", str(out)]) == 1
+    assert statuses(out) == {
+        "ALONE_1": ("failed", "film-missing"),
+        "EMPTY_1": ("failed", "film-unreadable"),
+        "TEXT_1": ("failed", "film-unreadable"),
+        "TRUNC_1": ("failed", "film-unreadable"),
+        FIRST: ("ok", ""),
+        SECOND: ("ok", ""),
+        "nameless": ("failed", "film-name"),
+    }
+    messages = dict(read(out, "exams").select("subject", "message").iter_rows())
+    assert "_f2" in messages["ALONE"]
+    assert all(messages[subject] for subject in ("EMPTY", "TRUNC", "TEXT", "nameless"))
+
+
+def test_films_without_pitch_fail_and_name_the_option(tmp_path: Path, exams: list[RenderedExamination]) -> None:
+    folder, out = tmp_path / "bare", tmp_path / "out"
+    exams[0].write(folder, with_pitch=False)
+    command = ["measure", str(folder), "-o", str(out), "--cage", "2"]
+    assert run_app(command) == 1
+    assert statuses(out) == {FIRST: ("failed", "pitch-missing")}
+    assert "--pixel-pitch-mm" in read(out, "exams")["message"][0]
+    assert run_app([*command, "--pixel-pitch-mm", "0.15"]) == 0
+
+
+def test_films_without_markers_or_of_another_cage_are_never_ok(folder: Path, tmp_path: Path, exams: list[RenderedExamination]) -> None:
+    out = tmp_path / "out"
+    assert run_app(["measure", str(folder), "-o", str(out), "--cage", "1B", "--film", "separate"]) == 1
+    assert {status for status, _ in statuses(out).values()} == {"failed"}
+    assert len(read(out, "images")) == sum(len(exam.images) for exam in exams)  # what was found is kept
+    assert not len(read(out, "markers"))
+
+
+def test_the_cage_exposed_apart(folder: Path, tmp_path: Path, other_film: Callable[[str, str], Path]) -> None:
+    for k in (1, 2):
+        other_film(f"{FIRST}_f{k}.tif", f"{FIRST}_f{k}_cage.tif")
+    out = tmp_path / "out"
+    run_app(["measure", str(folder), "-o", str(out)])
+    images = read(out, "images").filter(pl.col("exam") == "202601010900")
+    roles = {(role, "_cage" in file) for role, file in images.select("role", "file").iter_rows()}
+    assert {("fiducial", True), ("control", True), ("object", False)} <= roles
+    assert not roles & {("fiducial", False), ("control", False), ("object", True)}
+
+
+@pytest.mark.parametrize(
+    ("options", "remedy"),
+    [
+        (["--cage", "3C"], "cage list"),
+        (["--method", "bundle"], "selvik"),
+        (["--segments", "segments.csv"], "--segments"),
+        (["--dask", "tcp://somewhere"], "--jobs"),
+        (["--jobs", "0"], "at least one"),
+        (["--timeout-s", "-1"], "positive"),
+        (["--response", "loud"], "response"),
+        (["--pixel-pitch-mm", "nan"], "pixel_pitch_mm"),
+        (["--study", "missing.toml"], "missing.toml"),
+        (["--file-pattern", "("], "file_pattern"),
+    ],
+)
+def test_wrong_usage_stops_the_run_with_one_message(
+    folder: Path, tmp_path: Path, options: list[str], remedy: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_app(["measure", str(folder), "-o", str(tmp_path / "out"), *options]) == 2
+    message = capsys.readouterr().err
+    assert remedy in message
+    assert "Traceback" not in message
+    assert not (tmp_path / "out" / "exams.csv").exists()
+
+
+def test_no_cage_no_folder_no_film_and_a_place_that_cannot_be_written(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "study.toml").unlink()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (tmp_path / "file").write_bytes(b"")
+    for arguments, remedy in [
+        ([str(folder), "-o", str(tmp_path / "out")], "--cage"),
+        ([str(tmp_path / "none"), "-o", str(tmp_path / "out")], "no such folder"),
+        ([str(empty), "-o", str(tmp_path / "out"), "--cage", "2"], "no film"),
+        ([str(folder), "-o", str(tmp_path / "file"), "--cage", "2"], "another place with -o"),
+        ([str(folder)], "out"),
+    ]:
+        assert run_app(["measure", *arguments]) == 2
+        assert remedy in capsys.readouterr().err
+
+
+def test_the_report_is_one_page_made_from_the_results_alone(folder: Path, tmp_path: Path, other_film: Callable[[str, str], Path]) -> None:
+    other_film(f"{FIRST}_f1.tif", "A<b>_1_f1.tif")
+    out = tmp_path / "out"
+    run_app(["measure", str(folder), "-o", str(out)])
+    first = (out / "report.html").read_text()
+    assert "A&lt;b&gt;" in first
+    assert "<b>_1" not in first
+    assert REASONS["film-missing"].split(";")[0] in first.replace("&#39;", "'")
+    assert first.count("data:image/jpeg;base64,") == 4
+    assert "http://" not in first
+    assert "https://" not in first
+    for path in folder.iterdir():
+        path.unlink()
+    (out / "report.html").unlink()
+    assert run_app(["report", str(out)]) == 0
+    assert (out / "report.html").read_text() == first
+    assert run_app(["report", str(tmp_path)]) == 2
+
+
+def test_the_python_function_does_the_same_and_raises_what_the_command_prints(folder: Path, tmp_path: Path) -> None:
+    summary = rsa_vision.measure(folder, tmp_path / "out", cage="2")
+    assert (summary.exit_code, summary.count("ok")) == (0, 2)
+    with pytest.raises(rsa_vision.RsaError, match="selvik"):
+        rsa_vision.measure(folder, tmp_path / "out", method="bundle")
+    with pytest.raises(rsa_vision.RsaError, match="unknown_key"):
+        rsa_vision.measure(folder, tmp_path / "out", unknown_key=1)
