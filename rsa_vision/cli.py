@@ -44,7 +44,7 @@ def run_app(arguments: list[str]) -> int:
     from rsa_vision.errors import RsaError
 
     try:
-        code = app(arguments, prog_name="rsa-vision", standalone_mode=False)
+        code = int(app(arguments, prog_name="rsa-vision", standalone_mode=False) or 0)
         sys.stdout.flush()
     except RsaError as error:
         _complain(str(error))
@@ -53,8 +53,7 @@ def run_app(arguments: list[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (KeyboardInterrupt, typer.Abort):
-        _complain("stopped; the same command goes on with what is left")
-        return INTERRUPTED
+        code = INTERRUPTED
     except Exception as error:
         # a usage error of typer knows how to show itself, and its exit code
         show, exit_code = getattr(error, "show", None), getattr(error, "exit_code", None)
@@ -63,7 +62,9 @@ def run_app(arguments: list[str]) -> int:
             return 2
         show()
         return int(exit_code)
-    return int(code or 0)
+    if code == INTERRUPTED:  # typer makes an exit code of Ctrl-C by itself
+        _complain("stopped; the same command goes on with what is left")
+    return code
 
 
 def _show_version(wanted: bool) -> None:

@@ -61,7 +61,9 @@ def test_every_image_stands_in_the_table_with_its_names(folder: Path, tmp_path: 
         keys = ["focus", "role", "number"]
         joined = truth.join(found, on=keys, how="left", suffix="_found")
         assert len(joined) == len(truth) == len(found)
-        off = joined.select((pl.col("col_px") - pl.col("col_px_found")).abs().max(), (pl.col("row_px") - pl.col("row_px_found")).abs().max())
+        off = joined.select(
+            (pl.col("col_px") - pl.col("col_px_found")).abs().max(), (pl.col("row_px") - pl.col("row_px_found")).abs().max()
+        )
         assert max(off.row(0)) < 0.2
         assert len(images.filter(pl.col("file") == name)) == len(rendered.images.filter(pl.col("file") == name))
 

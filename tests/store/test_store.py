@@ -50,7 +50,16 @@ def test_what_cannot_be_written_names_the_remedy(tmp_path: Path) -> None:
 
 def test_tables_keep_every_digit_and_empty_means_not_determined(tmp_path: Path) -> None:
     rows = failed_rows("S,1", "2", ["a.tif", "b.tif"], "film-missing", 'no "film"')
-    marker = {"subject": "S,1", "exam": "2", "segment": "", "marker": "P01", "x_mm": 1 / 3, "y_mm": float("nan"), "n_views": 1, "flags": "one-view"}
+    marker = {
+        "subject": "S,1",
+        "exam": "2",
+        "segment": "",
+        "marker": "P01",
+        "x_mm": 1 / 3,
+        "y_mm": float("nan"),
+        "n_views": 1,
+        "flags": "one-view",
+    }
     write_tables(tmp_path, [rows | {"markers": [marker]}])
     text = (tmp_path / "markers.csv").read_text()
     assert "nan" not in text.lower()

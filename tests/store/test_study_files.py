@@ -104,6 +104,8 @@ def test_a_wrong_pattern_is_refused(tmp_path: Path, pattern: str, message: str) 
 
 
 def test_dicom_tags_name_what_file_names_do_not(tmp_path: Path) -> None:
-    tags = {f"1.2.3.{k}": {"patient_id": "P7", "acquisition_date": "20260101", "acquisition_time": "090012", "view": f"F{k}"} for k in (1, 2)}
+    tags = {
+        f"1.2.3.{k}": {"patient_id": "P7", "acquisition_date": "20260101", "acquisition_time": "090012", "view": f"F{k}"} for k in (1, 2)
+    }
     found = only(group(tmp_path, "README", *tags, read_tags=lambda path: tags.get(path.name)))
     assert (found.subject, found.exam, [film.focus for film in found.films], found.problem) == ("P7", "202601010900", [1, 2], None)

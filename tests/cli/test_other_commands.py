@@ -1,0 +1,185 @@
+"""`detect`, `reconstruct`, `cage`, and how quickly the program starts."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import polars as pl
+import pytest
+
+import rsa_vision
+from rsa_vision.cli import run_app
+from rsa_vision.flags import MarkerFlag
+from rsa_vision.types import MarkerImages
+from synthetic.study import RenderedExamination, render_examination
+
+EXACT_MM = 1e-6  # exact image points
+HELP_S = 0.3  # and nothing heavy is imported; the slowest of a busy machine is not judged
+TEXT = {"exam": pl.String, "number": pl.String, "marker": pl.String, "flags": pl.String}
+
+
+@pytest.fixture
+def two_images(monkeypatch: pytest.MonkeyPatch) -> MarkerImages:
+    """Let every film show a ball and a tee."""
+    images = MarkerImages(
+        position_px=np.array([[100.25, 200.5], [300.0, 50.0]]),
+        covariance_px2=np.array([[[4e-4, 1e-4], [1e-4, 9e-4]], [[np.nan, np.nan], [np.nan, np.nan]]]),
+        shape=np.array(["ball", "tee"]),
+        radius_px=np.array([4.0, 2.5]),
+        angle_deg=np.array([np.nan, 90.0]),
+        contrast=np.array([0.6, 0.3]),
+        snr=np.array([40.0, 20.0]),
+        flags=np.array([0, MarkerFlag.EDGE | MarkerFlag.SATURATED]),
+    )
+    monkeypatch.setattr("rsa_vision.detect.detect_markers", lambda values, **_: SimpleNamespace(images=images, response="linear"))
+    return images
+
+
+@pytest.mark.usefixtures("two_images")
+def test_detect_writes_the_published_columns(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    films = [str(path) for path in sorted(folder.glob("*_f1.tif"))]
+    out = tmp_path / "found.csv"
+    assert run_app(["detect", *films, "-o", str(out), "--overlay", str(tmp_path / "seen.png")]) == 0
+    assert "4 marker images on 2 films" in capsys.readouterr().out
+    table = pl.read_csv(out)
+    published = "file, shape, col_px, row_px, sd_col_px, sd_row_px, cov_col_row_px2, radius_px, angle_deg, contrast, snr, flags"
+    assert table.columns == published.split(", ")
+    assert table["file"].to_list() == [films[0]] * 2 + [films[1]] * 2
+    ball, tee = table.to_dicts()[:2]
+    assert ball["sd_col_px"] == pytest.approx(0.02)
+    assert ball["cov_col_row_px2"] == pytest.approx(1e-4)
+    assert ball["angle_deg"] is None
+    assert (tee["sd_row_px"], tee["flags"]) == (None, "edge;saturated")
+    for name in ("202601010900", "202602010900"):
+        drawn = cv2.imread(str(tmp_path / f"seen_S01_{name}_f1.png"))
+        colour = np.abs(drawn.astype(int) - drawn[..., :1]).max(axis=-1) > 60
+        rows, cols = np.nonzero(colour[150:250, 50:150])
+        assert abs(rows.mean() + 150 - 200.5) < 2
+        assert abs(cols.mean() + 50 - 100.25) < 2
+
+
+@pytest.mark.usefixtures("two_images")
+def test_detect_goes_on_after_a_bad_film(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film, bad = next(folder.glob("*.tif")), tmp_path / "bad.tif"
+    bad.write_bytes(b"II*\0")
+    assert run_app(["detect", str(bad), str(film), "-o", str(tmp_path / "found.csv")]) == 1
+    assert "bad.tif" in capsys.readouterr().err
+    assert len(pl.read_csv(tmp_path / "found.csv")) == 2
+    with pytest.raises(rsa_vision.RsaError, match="bad.tif"):
+        rsa_vision.detect([bad])
+
+
+@pytest.fixture(scope="module")
+def exposure() -> RenderedExamination:
+    return render_examination("1A", rng=np.random.default_rng(5), n_objects=5, pitch_mm=0.4, fine=1, quanta=None)
+
+
+@pytest.mark.parametrize("columns", ["names", "id"])
+def test_reconstruct_from_exact_points(exposure: RenderedExamination, tmp_path: Path, columns: str) -> None:
+    points = exposure.images.filter(pl.col("role") != "unassigned")
+    objects = {name: str(101 + k) for k, name in enumerate(sorted(points.filter(pl.col("role") == "object")["number"].unique()))}
+    points = points.with_columns(pl.col("number").replace(objects)).select("subject", "exam", "focus", "role", "number", "col_px", "row_px")
+    if columns == "id":
+        number = pl.col("number").cast(pl.Int64) * 10 + pl.col("focus")
+        points = points.with_columns(number.alias("id")).select("subject", "exam", "id", "col_px", "row_px")
+    points.write_csv(tmp_path / "points.csv")
+    out = tmp_path / "out"
+    assert run_app(["reconstruct", str(tmp_path / "points.csv"), "--cage", "1A", "-o", str(out)]) == 0
+    markers = pl.read_csv(out / "markers.csv", schema_overrides=TEXT)
+    truth = exposure.markers.with_columns((pl.col("segment") + "/" + pl.col("marker")).replace(objects).alias("name"))
+    both = truth.join(markers, left_on="name", right_on="marker", suffix="_found")
+    assert len(both) == len(truth) == len(markers)
+    for axis in "xyz":
+        assert (both[f"{axis}_mm"] - both[f"{axis}_mm_found"]).abs().max() < EXACT_MM
+    assert {"exams.csv", "images.csv", "foci.csv", "markers.csv", "run.json", "report.html"} <= {path.name for path in out.iterdir()}
+
+
+def test_reconstruct_refuses_what_it_cannot_use(exposure: RenderedExamination, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = tmp_path / "points.csv"
+    fiducials = exposure.images.filter(pl.col("role") == "fiducial")
+    fiducials.write_csv(points)
+    assert run_app(["reconstruct", str(points), "-o", str(tmp_path / "out")]) == 2
+    assert "--cage" in capsys.readouterr().err
+    assert run_app(["reconstruct", str(tmp_path / "none.csv"), "--cage", "1A", "-o", str(tmp_path / "out")]) == 2
+    assert run_app(["reconstruct", str(points), "--cage", "1A", "-o", str(tmp_path / "out")]) == 1
+    (row,) = pl.read_csv(tmp_path / "out" / "exams.csv").to_dicts()
+    assert (row["status"], row["reasons"]) == ("failed", "geometry")
+    assert len(pl.read_csv(tmp_path / "out" / "images.csv")) == len(fiducials)
+
+
+def test_cages_are_listed_drawn_and_checked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["cage", "list"]) == 0
+    listed = capsys.readouterr().out
+    assert [line.split()[0] for line in listed.splitlines()] == ["1A", "1B", "1B-420", "2"]
+    drawing = tmp_path / "1A.svg"
+    assert run_app(["cage", "show", "1A", "-o", str(drawing)]) == 0
+    assert "ambiguity" in capsys.readouterr().out
+    assert "<svg" in drawing.read_text()
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text('name = "W"\nfilm = "loose"\n')
+    assert run_app(["cage", "check", str(wrong)]) == 2
+    message = capsys.readouterr().err
+    assert "film" in message
+    assert "foci" in message
+
+
+@pytest.mark.parametrize("arguments", [["frobnicate"], ["measure", "--frobnicate"], ["cage", "show"], []])
+def test_usage_errors_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(arguments) == 2
+    assert "Usage" in (shown := capsys.readouterr()).out + shown.err
+
+
+def test_commands_that_are_not_built_are_not_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(command in shown for command in ("measure", "detect", "reconstruct", "report", "cage", "demo"))
+    assert not any(command in shown for command in ("motion", "growth", "precision", "calibrate", "plan", "review"))
+
+
+def _run(*arguments: str) -> tuple[subprocess.CompletedProcess[str], float]:
+    started = time.perf_counter()
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
+    return done, time.perf_counter() - started
+
+
+def test_help_imports_nothing_heavy_and_is_quick() -> None:
+    done, _ = _run("-X", "importtime", "-m", "rsa_vision", "--help")
+    assert done.returncode == 0
+    heavy = {"numpy", "scipy", "cv2", "polars", "pydantic", "jinja2", "matplotlib"}
+    assert not heavy & {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    empty = min(_run("-c", "")[1] for _ in range(3))
+    assert min(_run("-m", "rsa_vision", "--help")[1] for _ in range(3)) - empty < HELP_S
+
+
+def test_importing_a_module_does_not_hide_the_command_of_its_name() -> None:
+    for name in ("detect", "report"):
+        code = f"import rsa_vision; before = callable(rsa_vision.{name}); import rsa_vision.{name} as m; print(before, callable(m), m.__file__)"
+        done, _ = _run("-c", code)
+        assert done.stdout.startswith("True True"), done.stderr
+
+
+def test_an_unexpected_failure_is_a_message_not_a_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def broken(*_: Any, **__: Any) -> None:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr("rsa_vision.api.report", broken)
+    assert run_app(["report", "anywhere"]) == 2
+    message = capsys.readouterr().err
+    assert "ZeroDivisionError: by nothing" in message
+    assert "Traceback" not in message
+
+
+def test_ctrl_c_says_that_the_same_command_goes_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rsa_vision.api.measure", interrupted)
+    assert run_app(["measure", "a", "-o", "b"]) == 130
+    assert "goes on" in capsys.readouterr().err
