@@ -7,25 +7,18 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Final
-
-from pydantic import ValidationError
+from typing import TYPE_CHECKING, Any
 
 from rsa_vision.batch import Outcome, Task, run
-from rsa_vision.errors import CageError, FilmError, SettingsError, UsageError
+from rsa_vision.errors import FilmError, UsageError
+from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
 from rsa_vision.provenance import environment, file_sha256
-from rsa_vision.settings import Study, describe_validation, load_study
+from rsa_vision.settings import Study
 from rsa_vision.store import to_csv, write_atomic, write_run, write_tables
-from rsa_vision.study_files import Grouping, group_films
+from rsa_vision.study_files import natural_key
 
 if TYPE_CHECKING:
     import polars as pl
-
-    from rsa_vision.cages import Cage
-    from rsa_vision.cameras import Camera
-
-STUDY_FILE: Final = "study.toml"
-METHODS: Final = ("selvik",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,13 +106,13 @@ def measure(
     """
     started = datetime.now(UTC)
     folder, out = Path(folder), Path(out)
-    _refuse(method, segments, dask, jobs, timeout_s)
+    refuse_unbuilt(method, segments, dask, jobs, timeout_s)
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of the films")
-    study_file = Path(study) if study is not None else _default_study(folder)
+    study_file = Path(study) if study is not None else default_study(folder)
     settled = settle(study_file, settings)
-    geometry, about = _geometry(settled)
-    grouping = _group(folder, settled, geometry)
+    geometry, about = load_geometry(settled)
+    grouping = group(folder, settled, geometry)
     _prepare(out)
     depends_on = {"settings": _described(settled), "geometry": about, "method": method}
     tasks = [Task(files, settled, geometry, depends_on, out, redo) for files in grouping.exams]
@@ -185,13 +178,13 @@ def reconstruct(
     exams = read_points(points, loaded)
     _prepare(out)
     outcomes = []
-    for (subject, exam), table in sorted(exams.items(), key=lambda item: _exam_key(*item[0])):
+    for (subject, exam), table in sorted(exams.items(), key=lambda item: (natural_key(item[0][0]), natural_key(item[0][1]))):
         began = perf_counter()
         result = reconstruct_points(table, settled, loaded)
         rows = examination_rows(subject, exam, [points.name], result, perf_counter() - began)
         outcomes.append(Outcome(subject, exam, rows))
     write_tables(out, (outcome.rows for outcome in outcomes))
-    record = _record("reconstruct", started, points, study_file, settled, {"cage": _cage_content(loaded)})
+    record = _record("reconstruct", started, points, study_file, settled, {"cage": cage_content(loaded)})
     _finish(out, record | {"inputs": [{"path": str(points.resolve()), "sha256": file_sha256(points)}]})
     return Summary(out, tuple(outcomes))
 
@@ -304,105 +297,6 @@ def demo(folder: str | Path = "rsa-vision-demo", *, seed: int = 1, watch: Watche
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from error
     return [measure(study, study / "results", watch=watch) for study in studies]
-
-
-def settle(study_file: Path | None, options: Mapping[str, Any]) -> Study:
-    """Return the settings of a study file with options over them.
-
-    Parameters
-    ----------
-    study_file : Path or None
-    options : mapping
-        Keys of the study file; None is "not given".
-
-    Returns
-    -------
-    Study
-
-    Raises
-    ------
-    SettingsError
-        If a key is unknown or a value wrong; all are listed.
-    """
-    base = load_study(study_file) if study_file is not None else Study()
-    given = {key: str(value) if isinstance(value, Path) else value for key, value in options.items() if value is not None}
-    try:
-        return Study.model_validate({**base.model_dump(exclude_unset=True), **given})
-    except ValidationError as error:
-        raise SettingsError(f"wrong options\n{describe_validation(error)}") from error
-
-
-def _refuse(method: str, segments: object, dask: object, jobs: int, timeout_s: float | None) -> None:
-    if method == "bundle":
-        raise UsageError('method "bundle" is not built yet; use --method selvik')
-    if method not in METHODS:
-        raise UsageError(f"method {method!r} is not known; use selvik")
-    if segments is not None:
-        raise UsageError("markers are not matched with known segments yet; leave --segments out: they are named P01, P02, ...")
-    if dask is not None:
-        raise UsageError("runs on many machines are not built yet; leave --dask out and use --jobs")
-    if jobs < 1:
-        raise UsageError(f"--jobs {jobs}: at least one process is needed")
-    if timeout_s is not None and not timeout_s > 0:
-        raise UsageError(f"--timeout-s {timeout_s:g}: a positive number of seconds is needed")
-
-
-def _default_study(folder: Path) -> Path | None:
-    path = folder / STUDY_FILE
-    return path if path.is_file() else None
-
-
-def _geometry(study: Study) -> tuple[Cage | dict[int, Camera], dict[str, Any]]:
-    """Return the cage or the cameras, and their content for ``run.json``."""
-    from rsa_vision.cages import load_cage
-
-    if study.calibration:
-        from rsa_vision.cameras import load_camera
-
-        cameras = {focus: load_camera(path) for focus, path in sorted(study.calibration.items())}
-        if len(cameras) < 2:
-            raise UsageError("calibration: one camera sees no depth; give the files of two or more")
-        about = {str(focus): {"path": str(path), "sha256": file_sha256(path)} for focus, path in sorted(study.calibration.items())}
-        return cameras, {"calibration": about}
-    if study.cage is None:
-        raise UsageError("no cage: name it with --cage or `cage` in study.toml (see `rsa-vision cage list`), or give `calibration` there")
-    cage = load_cage(study.cage)
-    if unknown := sorted(set(study.foci) - set(cage.foci)):
-        raise SettingsError(f"[foci]: cage {cage.name} has no focus {unknown[0]}; it has {', '.join(map(str, sorted(cage.foci)))}")
-    if len(cage.foci) < 2:
-        raise CageError(f"cage {cage.name} has one focus, which sees no depth; two or more are needed to measure")
-    return cage, {"cage": _cage_content(cage)}
-
-
-def _cage_content(cage: Cage) -> dict[str, Any]:
-    return {"name": cage.name, "sha256": cage.sha256, "content": cage.model_dump(mode="json", exclude_none=True)}
-
-
-def _group(folder: Path, study: Study, geometry: Cage | dict[int, Camera]) -> Grouping:
-    from rsa_vision.cages import Cage
-
-    if isinstance(geometry, Cage):
-        foci = sorted(geometry.foci)
-        shared = len({id(geometry.plane_of(focus)) for focus in foci}) == 1
-    else:
-        foci, shared = sorted(geometry), False
-    return group_films(folder, foci, study.film, shared_possible=shared, file_pattern=study.file_pattern, read_tags=_dicom_tags)
-
-
-def _dicom_tags(path: Path) -> Mapping[str, str] | None:
-    from rsa_vision.images import open_header
-
-    try:
-        header = open_header(path)
-    except FilmError:
-        return None
-    return header.meta if header.format == "DICOM" else None
-
-
-def _exam_key(subject: str, exam: str) -> Any:
-    from rsa_vision.study_files import natural_key
-
-    return natural_key(subject), natural_key(exam)
 
 
 def _prepare(out: Path) -> None:

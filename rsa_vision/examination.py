@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Final
 
 import numpy as np
 
@@ -14,52 +12,19 @@ from rsa_vision.cages import Cage
 from rsa_vision.cameras import Camera
 from rsa_vision.detect import detect_markers
 from rsa_vision.errors import CalibrationError, RsaError
-from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.camera import camera_rays
-from rsa_vision.geometry.rays import RayBundle, intersect_lines
+from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.cage import CageIdentification, identify_cage
 from rsa_vision.identify.pairs import Pairing, Region, cage_region, pair_rays
 from rsa_vision.images import require_pitch
+from rsa_vision.readings import FilmReading, Readings, candidates, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Study
-from rsa_vision.types import Bool, Film, Float, ImagePoints, Int, MarkerImages, Reconstruction
+from rsa_vision.types import Film, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
 from rsa_vision.xray import rays_of, reconstruct, reconstruct_calibrated, solve_focus
 
-LOOKALIKE: Final = 1.35  # images of equal balls differ in radius by the magnification alone, at most by this factor
-OBJECT_SHAPE: Final = "ball"
-
 ExposedFilm = tuple[Film, int | None]
 """A film and the focus that it belongs to, None for all foci."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FilmReading:
-    """What one film says, without its pixels.
-
-    Attributes
-    ----------
-    path : Path
-    focus : int or None
-        None: it carries all foci.
-    shape : tuple of two ints
-        (rows, cols).
-    bits : int
-    pitch_mm : tuple of two floats, or None
-        (row, column) pitch as used; None with calibrated cameras, which need none.
-    pitch_source : str
-    response : str
-        Film response as set or found.
-    images : MarkerImages
-    """
-
-    path: Path
-    focus: int | None
-    shape: tuple[int, int]
-    bits: int
-    pitch_mm: tuple[float, float] | None
-    pitch_source: str
-    response: str
-    images: MarkerImages
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,16 +79,16 @@ def measure_examination(
     ExaminationResult
         Expected failures (no pitch, cage not found, too few marks) are verdicts, not exceptions.
     """
-    table = _Images.of(())
+    table = Readings.of(())
     seconds: dict[str, float] = {}
     started = perf_counter()
     try:
         every = [*cage_films, *films]
         pitches = [require_pitch(film, study.pixel_pitch_mm) if isinstance(geometry, Cage) else None for film, _ in every]
-        table = _Images.of([_read(*exposed, pitch, study) for exposed, pitch in zip(every, pitches, strict=True)])
+        table = Readings.of([_read(*exposed, pitch, study) for exposed, pitch in zip(every, pitches, strict=True)])
         seconds["detect"] = perf_counter() - started
         if blank := [film.path.name for film in table.films if not len(film.images)]:
-            return table.failed([("no-markers", f"{name}: no marker image was found") for name in blank], seconds)
+            return _failed(table, [("no-markers", f"{name}: no marker image was found") for name in blank], seconds)
         started = perf_counter()
         if isinstance(geometry, Cage):
             result = _with_cage(table, len(cage_films), study, geometry)
@@ -132,7 +97,7 @@ def measure_examination(
         seconds["name and reconstruct"] = perf_counter() - started
         return replace(result, seconds=seconds)
     except RsaError as error:
-        return table.failed([(error.code, str(error))], seconds)
+        return _failed(table, [(error.code, str(error))], seconds)
 
 
 def reconstruct_points(points: ImagePoints, study: Study, cage: Cage) -> ExaminationResult:
@@ -158,69 +123,32 @@ def reconstruct_points(points: ImagePoints, study: Study, cage: Cage) -> Examina
     return ExaminationResult((), reconstruction.points, None, reconstruction, verdict)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Images:
-    """Points of an examination and the row of each in the table of all images, film after film (`radius_px`, `contrast`, `source`)."""
-
-    films: tuple[FilmReading, ...]
-    points: ImagePoints
-    rows: Int
-
-    @classmethod
-    def of(cls, films: Sequence[FilmReading]) -> _Images:
-        tables = [_unassigned(film.images, film.focus or 0, index) for index, film in enumerate(films)]
-        points = concatenated(tables or [_unassigned(MarkerImages.empty(), 0, 0)])
-        return cls(tuple(films), points, np.arange(len(points)))
-
-    @property
-    def radius_px(self) -> Float:
-        return np.concatenate([film.images.radius_px for film in self.films])
-
-    @property
-    def contrast(self) -> Float:
-        return np.concatenate([film.images.contrast for film in self.films])
-
-    @property
-    def source(self) -> Int:
-        """Row of each point in the images of its film."""
-        return np.concatenate([np.arange(len(film.images)) for film in self.films])[self.rows] if self.films else self.rows
-
-    def with_points(self, points: ImagePoints, rows: Int) -> _Images:
-        return _Images(self.films, points, rows)
-
-    def failed(self, findings: Sequence[Finding], seconds: Mapping[str, float] | None = None) -> ExaminationResult:
-        return ExaminationResult(self.films, self.points, self.source, None, conclude(findings), seconds=seconds or {})
-
-    def judged(self, reconstruction: Reconstruction, findings: Sequence[Finding]) -> ExaminationResult:
-        return ExaminationResult(self.films, reconstruction.points, self.source, reconstruction, conclude(findings))
-
-
-def _with_cage(table: _Images, n_cage_films: int, study: Study, cage: Cage) -> ExaminationResult:
+def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> ExaminationResult:
     cage = cage.at_temperature(study.temperature_c)
     marks = [_identify(film, study, cage) for film in table.films[: n_cage_films or None]]
     findings = [(code, f"{film.path.name}: {_explain(code, m)}") for film, m in zip(table.films, marks, strict=False) for code in m.reasons]
     if not all(marks):
-        return table.failed(findings)
-    named, free, foreign = _name_marks(table, marks, n_cage_films)
+        return _failed(table, findings)
+    named, free, foreign = name_marks(table, marks, n_cage_films)
     foci = sorted(set(named.points.focus.tolist()))
     fits = {focus: solve_focus(named.points.rows(named.points.focus == focus), cage, focus, study.limits).solution for focus in foci}
     findings += [finding for film, m in zip(table.films, marks, strict=False) for finding in _stretch(film, m)]
     bundles = []
     for focus in foci:
-        rows = _candidates(table, free, focus)
+        rows = candidates(table, free, focus)
         bundles.append(rays_of(table.points.position_px[rows], table.points.covariance_px2[rows], fits[focus], cage, rows))
     bundle = joined_rays(bundles)
     centre = named.points.position_px.mean(axis=0)
     scale = {focus: local_scale(fit.plane_from_film, centre) for focus, fit in fits.items()}
     region = cage_region(cage, {focus: fit.position_mm for focus, fit in fits.items()})
     pairing = _pair(table, bundle, scale, study, region)
-    complete = _name_objects(named, table, bundle, pairing, foreign)
+    complete = name_objects(named, table, bundle, pairing, foreign)
     reconstruction = reconstruct(complete.points, cage, study.limits)
-    findings += [(code, "") for code in pairing.reasons] + _lonely(table, pairing, bundle)
-    return complete.judged(reconstruction, findings + judge(reconstruction, _nominal(study, cage), study.limits))
+    findings += [(code, "") for code in pairing.reasons] + lonely_images(table, pairing, bundle)
+    return _judged(complete, reconstruction, findings + judge(reconstruction, _nominal(study, cage), study.limits))
 
 
-def _with_cameras(table: _Images, study: Study, cameras: Mapping[int, Camera]) -> ExaminationResult:
+def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) -> ExaminationResult:
     for film in table.films:
         if film.focus is None:
             raise CalibrationError(f"{film.path.name}: calibrated cameras need a film for each focus; name the films _f1, _f2")
@@ -230,22 +158,22 @@ def _with_cameras(table: _Images, study: Study, cameras: Mapping[int, Camera]) -
     everything = np.ones(len(table.points), bool)
     bundles, scale = [], {}
     for focus, camera in sorted(cameras.items()):
-        rows = _candidates(table, everything, focus)
+        rows = candidates(table, everything, focus)
         bundles.append(camera_rays(camera, focus, table.points.position_px[rows], table.points.covariance_px2[rows], rows))
         # the rays' second points lie as far away as the origin of the calibration
         scale[focus] = float(np.linalg.norm(camera.translation) / camera.matrix[0, 0])
     bundle = joined_rays(bundles)
     pairing = _pair(table, bundle, scale, study, None)
     nothing = table.with_points(table.points.rows(~everything), table.rows[:0])
-    complete = _name_objects(nothing, table, bundle, pairing, ~everything)
-    findings = [(code, "") for code in pairing.reasons] + _lonely(table, pairing, bundle)
+    complete = name_objects(nothing, table, bundle, pairing, ~everything)
+    findings = [(code, "") for code in pairing.reasons] + lonely_images(table, pairing, bundle)
     if not pairing.groups:
-        return complete.failed([*findings, ("cage-not-found", "no image of one film meets one of the other: look at the calibration")])
+        return _failed(complete, [*findings, ("cage-not-found", "no image of one film meets one of the other: look at the calibration")])
     reconstruction = reconstruct_calibrated(complete.points, cameras, study.limits)
-    return complete.judged(reconstruction, findings + judge(reconstruction, {}, study.limits))
+    return _judged(complete, reconstruction, findings + judge(reconstruction, {}, study.limits))
 
 
-def _pair(table: _Images, bundle: RayBundle, mm_per_px: Mapping[int, float], study: Study, region: Region | None) -> Pairing:
+def _pair(table: Readings, bundle: RayBundle, mm_per_px: Mapping[int, float], study: Study, region: Region | None) -> Pairing:
     scale = np.array([mm_per_px[int(focus)] for focus in bundle.focus])
     return pair_rays(
         bundle, study.limits, region=region, radius_mm=table.radius_px[bundle.image] * scale, contrast=table.contrast[bundle.image]
@@ -296,94 +224,9 @@ def _stretch(film: FilmReading, found: CageIdentification) -> list[Finding]:
     return findings
 
 
-def _unassigned(images: MarkerImages, focus: int, film: int) -> ImagePoints:
-    n = len(images)
-    return ImagePoints(
-        focus=np.full(n, focus, np.int64),
-        role=np.full(n, "unassigned", "U10"),
-        number=np.full(n, "", "U40"),
-        shape=images.shape,
-        position_px=images.position_px,
-        covariance_px2=images.covariance_px2,
-        flags=images.flags,
-        film=np.full(n, film, np.int64),
-    )
+def _failed(readings: Readings, findings: Sequence[Finding], seconds: Mapping[str, float] | None = None) -> ExaminationResult:
+    return ExaminationResult(readings.films, readings.points, readings.source, None, conclude(findings), seconds=seconds or {})
 
 
-def concatenated(tables: Sequence[ImagePoints]) -> ImagePoints:
-    """Return the rows of all tables."""
-    return ImagePoints(*(np.concatenate([getattr(table, item.name) for table in tables]) for item in fields(ImagePoints)))
-
-
-def joined_rays(bundles: Sequence[RayBundle]) -> RayBundle:
-    """Return the rays of all bundles."""
-    return RayBundle(*(np.concatenate([getattr(bundle, item.name) for bundle in bundles]) for item in fields(RayBundle)))
-
-
-def _name_marks(table: _Images, marks: Sequence[CageIdentification], n_cage_films: int) -> tuple[_Images, Bool, Bool]:
-    """Return the cage's points of all foci, which images may be object markers, and which are of marks their focus should not see."""
-    first = np.searchsorted(table.points.film, np.arange(len(table.films)))
-    free, foreign = table.points.film >= n_cage_films, np.zeros(len(table.points), bool)
-    rows: list[int] = []
-    names: list[tuple[int, str, str]] = []
-    for start, found in zip(first.tolist(), marks, strict=False):
-        free[start + np.flatnonzero(found.explained)] = False
-        foreign[start + np.flatnonzero(found.foreign)] = True
-        for focus, assigned in sorted(found.assignments.items()):
-            for (role, number), image in sorted(assigned.items(), key=lambda item: (item[0][0] != "fiducial", item[0][1])):
-                rows.append(start + image)
-                names.append((focus, role, str(number)))
-    chosen = np.array(rows, int)
-    return table.with_points(_renamed(table.points.rows(chosen), names), chosen), free, foreign
-
-
-def _renamed(points: ImagePoints, names: Sequence[tuple[int, str, str]]) -> ImagePoints:
-    focus = np.array([name[0] for name in names], np.int64)
-    role = np.array([name[1] for name in names], "U10")
-    number = np.array([name[2] for name in names], "U40")
-    return replace(points, focus=focus, role=role, number=number)
-
-
-def _candidates(table: _Images, free: Bool, focus: int) -> Int:
-    points = table.points
-    return np.flatnonzero(free & (points.shape == OBJECT_SHAPE) & np.isin(points.focus, (0, focus)))
-
-
-def _name_objects(named: _Images, table: _Images, bundle: RayBundle, pairing: Pairing, foreign: Bool) -> _Images:
-    """Return the cage's points, then the object markers P01, P02, ... by rising y, then every other image as unassigned."""
-    places = [intersect_lines(bundle.origin_mm[list(g)], bundle.direction[list(g)])[0] for g in pairing.groups]
-    order = sorted(range(len(places)), key=lambda g: (places[g][1], places[g][0]))
-    rows: list[int] = []
-    names: list[tuple[int, str, str]] = []
-    ambiguous: list[int] = []
-    for count, g in enumerate(order):
-        for ray in pairing.groups[g]:
-            rows.append(int(bundle.image[ray]))
-            names.append((int(bundle.focus[ray]), "object", f"P{count + 1:02d}"))
-        if pairing.ambiguous[g]:
-            ambiguous += rows[-len(pairing.groups[g]) :]
-    others = np.setdiff1d(np.arange(len(table.points)), [*named.rows, *rows]).astype(int)
-    points = _renamed(table.points.rows(np.array(rows, int)), names)
-    flags = np.where(foreign, MarkerFlag.FOREIGN_MARK, 0)
-    flags[ambiguous] |= MarkerFlag.AMBIGUOUS
-    every = np.concatenate([named.rows, np.array(rows, int), others])
-    joined = concatenated([named.points, points, table.points.rows(others)])
-    return named.with_points(replace(joined, flags=joined.flags | flags[every]), every)
-
-
-def _lonely(table: _Images, pairing: Pairing, bundle: RayBundle) -> list[Finding]:
-    """Find single images that look like those of markers: a marker that the other focus does not show, or hidden there."""
-    paired = np.array([bundle.image[ray] for group in pairing.groups for ray in group], int)
-    if not len(paired) or not len(pairing.unmatched):
-        return []
-    size, contrast = table.radius_px[paired], table.contrast[paired]
-    alone = pairing.unmatched
-    like = (table.radius_px[alone] > size.min() / LOOKALIKE) & (table.radius_px[alone] < size.max() * LOOKALIKE)
-    like &= (table.contrast[alone] > contrast.min() / LOOKALIKE) & (table.contrast[alone] < contrast.max() * LOOKALIKE)
-    return [("marker-one-view", _where(table, int(row))) for row in alone[like]]
-
-
-def _where(table: _Images, row: int) -> str:
-    col, line = table.points.position_px[row]
-    film = table.films[table.points.film[row]].path.name
-    return f"{film}: an image at col {col:.0f}, row {line:.0f} looks like a marker but has no partner"
+def _judged(readings: Readings, reconstruction: Reconstruction, findings: Sequence[Finding]) -> ExaminationResult:
+    return ExaminationResult(readings.films, reconstruction.points, readings.source, reconstruction, conclude(findings))

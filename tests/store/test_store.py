@@ -14,12 +14,12 @@ from rsa_vision.tables import SCHEMAS, failed_rows
 # interfaces.md, "Files in OUT"
 PUBLISHED = {
     "exams": "subject, exam, status, reasons, files, method, n_markers, mean_parallax_um, seconds",
-    "images": "subject, exam, focus, role, number, shape, col_px, row_px, sd_col_px, sd_row_px, cov_col_row_px2, x_mm, y_mm, z_mm, residual_um, "
-    "used, flags, file",
-    "foci": "subject, exam, focus, x_mm, y_mm, z_mm, sd_x_mm, sd_y_mm, sd_z_mm, fiducial_rmse_um, fiducial_max_um, line_rmsv_um, line_max_um, "
-    "n_fiducials, n_controls",
-    "markers": "subject, exam, segment, marker, x_mm, y_mm, z_mm, sd_x_mm, sd_y_mm, sd_z_mm, cov_xy_mm2, cov_xz_mm2, cov_yz_mm2, crossing_um, "
-    "parallax_um, n_views, flags",
+    "images": "subject, exam, focus, role, number, shape, col_px, row_px, sd_col_px, sd_row_px, cov_col_row_px2, x_mm, y_mm, z_mm, "
+    "residual_um, used, flags, file",
+    "foci": "subject, exam, focus, x_mm, y_mm, z_mm, sd_x_mm, sd_y_mm, sd_z_mm, fiducial_rmse_um, fiducial_max_um, line_rmsv_um, "
+    "line_max_um, n_fiducials, n_controls",
+    "markers": "subject, exam, segment, marker, x_mm, y_mm, z_mm, sd_x_mm, sd_y_mm, sd_z_mm, cov_xy_mm2, cov_xz_mm2, cov_yz_mm2, "
+    "crossing_um, parallax_um, n_views, flags",
 }
 
 

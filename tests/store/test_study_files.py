@@ -85,7 +85,7 @@ def test_what_is_no_film_is_listed_with_the_reason(tmp_path: Path) -> None:
 
 def test_a_folder_without_films_names_the_remedy(tmp_path: Path) -> None:
     (tmp_path / "S01").mkdir()
-    with pytest.raises(UsageError, match="no film in it.*1 sub-folders"):
+    with pytest.raises(UsageError, match=r"no film in it.*1 sub-folders"):
         group_films(tmp_path, (1, 2))
     with pytest.raises(UsageError, match="not a folder"):
         group_films(tmp_path / "nowhere", (1, 2))

@@ -1,0 +1,179 @@
+"""What the films of one examination show, and the names that it gets: marks of the cage, object markers, the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from rsa_vision.flags import MarkerFlag
+from rsa_vision.geometry.rays import RayBundle, intersect_lines
+from rsa_vision.identify.cage import CageIdentification
+from rsa_vision.identify.pairs import Pairing
+from rsa_vision.types import Bool, Float, ImagePoints, Int, MarkerImages
+from rsa_vision.verdict import Finding
+
+LOOKALIKE: Final = 1.35  # images of equal balls differ in radius by the magnification alone, at most by this factor
+OBJECT_SHAPE: Final = "ball"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilmReading:
+    """What one film says, without its pixels.
+
+    Attributes
+    ----------
+    path : Path
+    focus : int or None
+        None: it carries all foci.
+    shape : tuple of two ints
+        (rows, cols).
+    bits : int
+    pitch_mm : tuple of two floats, or None
+        (row, column) pitch as used; None with calibrated cameras, which need none.
+    pitch_source : str
+    response : str
+        Film response as set or found.
+    images : MarkerImages
+    """
+
+    path: Path
+    focus: int | None
+    shape: tuple[int, int]
+    bits: int
+    pitch_mm: tuple[float, float] | None
+    pitch_source: str
+    response: str
+    images: MarkerImages
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """Points of an examination, and the row of each in the table of all images, film after film."""
+
+    films: tuple[FilmReading, ...]
+    points: ImagePoints
+    rows: Int
+
+    @classmethod
+    def of(cls, films: Sequence[FilmReading]) -> Readings:
+        """Return all images of films, unassigned."""
+        tables = [_unassigned(film.images, film.focus or 0, index) for index, film in enumerate(films)]
+        points = _concatenated(tables or [_unassigned(MarkerImages.empty(), 0, 0)])
+        return cls(tuple(films), points, np.arange(len(points)))
+
+    @property
+    def radius_px(self) -> Float:
+        """Radii in the table of all images."""
+        return np.concatenate([film.images.radius_px for film in self.films])
+
+    @property
+    def contrast(self) -> Float:
+        """Contrasts in the table of all images."""
+        return np.concatenate([film.images.contrast for film in self.films])
+
+    @property
+    def source(self) -> Int:
+        """Row of each point in the images of its film."""
+        return np.concatenate([np.arange(len(film.images)) for film in self.films])[self.rows] if self.films else self.rows
+
+    def with_points(self, points: ImagePoints, rows: Int) -> Readings:
+        """Return other points of the same films."""
+        return Readings(self.films, points, rows)
+
+
+def _unassigned(images: MarkerImages, focus: int, film: int) -> ImagePoints:
+    n = len(images)
+    return ImagePoints(
+        focus=np.full(n, focus, np.int64),
+        role=np.full(n, "unassigned", "U10"),
+        number=np.full(n, "", "U40"),
+        shape=images.shape,
+        position_px=images.position_px,
+        covariance_px2=images.covariance_px2,
+        flags=images.flags,
+        film=np.full(n, film, np.int64),
+    )
+
+
+def _concatenated(tables: Sequence[ImagePoints]) -> ImagePoints:
+    """Return the rows of all tables."""
+    return ImagePoints(*(np.concatenate([getattr(table, item.name) for table in tables]) for item in fields(ImagePoints)))
+
+
+def joined_rays(bundles: Sequence[RayBundle]) -> RayBundle:
+    """Return the rays of all bundles."""
+    return RayBundle(*(np.concatenate([getattr(bundle, item.name) for bundle in bundles]) for item in fields(RayBundle)))
+
+
+def name_marks(table: Readings, marks: Sequence[CageIdentification], n_cage_films: int) -> tuple[Readings, Bool, Bool]:
+    """Return the cage's points of all foci, which images may be object markers, and which are of marks their focus should not see."""
+    first = np.searchsorted(table.points.film, np.arange(len(table.films)))
+    free, foreign = table.points.film >= n_cage_films, np.zeros(len(table.points), bool)
+    rows: list[int] = []
+    names: list[tuple[int, str, str]] = []
+    for start, found in zip(first.tolist(), marks, strict=False):
+        free[start + np.flatnonzero(found.explained)] = False
+        foreign[start + np.flatnonzero(found.foreign)] = True
+        for focus, assigned in sorted(found.assignments.items()):
+            for (role, number), image in sorted(assigned.items(), key=lambda item: (item[0][0] != "fiducial", item[0][1])):
+                rows.append(start + image)
+                names.append((focus, role, str(number)))
+    chosen = np.array(rows, int)
+    return table.with_points(_renamed(table.points.rows(chosen), names), chosen), free, foreign
+
+
+def _renamed(points: ImagePoints, names: Sequence[tuple[int, str, str]]) -> ImagePoints:
+    focus = np.array([name[0] for name in names], np.int64)
+    role = np.array([name[1] for name in names], "U10")
+    number = np.array([name[2] for name in names], "U40")
+    return replace(points, focus=focus, role=role, number=number)
+
+
+def candidates(table: Readings, free: Bool, focus: int) -> Int:
+    """Return the rows of images that may be object markers of a focus."""
+    points = table.points
+    return np.flatnonzero(free & (points.shape == OBJECT_SHAPE) & np.isin(points.focus, (0, focus)))
+
+
+def name_objects(named: Readings, table: Readings, bundle: RayBundle, pairing: Pairing, foreign: Bool) -> Readings:
+    """Return the cage's points, then the object markers P01, P02, ... by rising y, then every other image as unassigned."""
+    places = [intersect_lines(bundle.origin_mm[list(g)], bundle.direction[list(g)])[0] for g in pairing.groups]
+    order = sorted(range(len(places)), key=lambda g: (places[g][1], places[g][0]))
+    rows: list[int] = []
+    names: list[tuple[int, str, str]] = []
+    ambiguous: list[int] = []
+    for count, g in enumerate(order):
+        for ray in pairing.groups[g]:
+            rows.append(int(bundle.image[ray]))
+            names.append((int(bundle.focus[ray]), "object", f"P{count + 1:02d}"))
+        if pairing.ambiguous[g]:
+            ambiguous += rows[-len(pairing.groups[g]) :]
+    others = np.setdiff1d(np.arange(len(table.points)), [*named.rows, *rows]).astype(int)
+    points = _renamed(table.points.rows(np.array(rows, int)), names)
+    flags = np.where(foreign, MarkerFlag.FOREIGN_MARK, 0)
+    flags[ambiguous] |= MarkerFlag.AMBIGUOUS
+    every = np.concatenate([named.rows, np.array(rows, int), others])
+    joined = _concatenated([named.points, points, table.points.rows(others)])
+    return named.with_points(replace(joined, flags=joined.flags | flags[every]), every)
+
+
+def lonely_images(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[Finding]:
+    """Find single images that look like those of markers: a marker that the other focus does not show, or hidden there."""
+    paired = np.array([bundle.image[ray] for group in pairing.groups for ray in group], int)
+    if not len(paired) or not len(pairing.unmatched):
+        return []
+    size, contrast = table.radius_px[paired], table.contrast[paired]
+    alone = pairing.unmatched
+    like = (table.radius_px[alone] > size.min() / LOOKALIKE) & (table.radius_px[alone] < size.max() * LOOKALIKE)
+    like &= (table.contrast[alone] > contrast.min() / LOOKALIKE) & (table.contrast[alone] < contrast.max() * LOOKALIKE)
+    return [("marker-one-view", _where(table, int(row))) for row in alone[like]]
+
+
+def _where(table: Readings, row: int) -> str:
+    col, line = table.points.position_px[row]
+    film = table.films[table.points.film[row]].path.name
+    return f"{film}: an image at col {col:.0f}, row {line:.0f} looks like a marker but has no partner"
