@@ -17,12 +17,13 @@ from rsa_vision.identify.appearance import FilmImages, film_images, on_bodies
 from rsa_vision.identify.checks import are_different, far_penalty, impossible_stretch, what_contradicts, what_is_missing
 from rsa_vision.identify.doubts import doubtful_marks, drop_gross_errors, without
 from rsa_vision.identify.film_model import FILM, Scene, build_scene, plane_from_film
-from rsa_vision.identify.hypotheses import find_hypotheses
-from rsa_vision.identify.naming import Naming, name_marks
+from rsa_vision.identify.hypotheses import find_hypotheses, moved_by_a_mark
+from rsa_vision.identify.naming import Naming, melted_images, name_marks
 from rsa_vision.settings import Limits
 from rsa_vision.types import Bool, Float, Int, MarkerImages
 
 TURN_DEG: Final = {"upright": 46.0, "mirrored": 46.0, "any": 180.0}  # largest angle between film and plane
+COMPLETE: Final = 0.85  # of the marks named: no grid moved by a row or column could do that
 LOG_FALSE: Final = 16.0  # evidence against clutter that is demanded: one false cage in 1e7 films
 LOG_MISLED: Final = 7.0  # evidence by which another orientation or focus than told must be better to say so
 
@@ -177,7 +178,13 @@ def _read(film: _Film, reading: _Reading, subset: Int, limits: Limits) -> CageId
     if among.sum() < 6:
         return answer.failed(f"{among.sum()} images only")
     starts = find_hypotheses(scene, seen.xy_mm[among], reading.turn_deg, limits)
-    return _decide(answer, scene, [n for n in (name_marks(scene, start, seen, log_room) for start in starts) if n], seen, limits, log_room)
+    namings = [naming for start in starts if (naming := name_marks(scene, start, seen, log_room))]
+    if namings:
+        best = max(namings, key=lambda n: n.log_evidence)
+        if (best.image[scene.own] >= 0).mean() < COMPLETE:
+            moved = moved_by_a_mark(scene, best.fit.parameters)
+            namings += [naming for start in moved if (naming := name_marks(scene, start, seen, log_room))]
+    return _decide(answer, scene, namings, seen, limits, log_room)
 
 
 def _doubt_what_was_told(film: _Film, told: _Reading, result: CageIdentification, limits: Limits) -> CageIdentification:
@@ -216,14 +223,20 @@ def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImag
     score, best = scored[0]
     rivals = [(s, n) for s, n in scored[1:] if are_different(scene, best, n)]
     log_odds = float(np.log(limits.posterior / (1 - limits.posterior)))
+    melted = melted_images(scene, best, film)
+    if len(melted):
+        again = name_marks(scene, best.fit.parameters, film, log_room, banned=melted)
+        if again is None:
+            return answer.failed("the images of both foci melt into one another")
+        lost = tuple((int(row), int(best.image[row])) for row in best.rows if best.image[row] in melted)
+        best = drop_gross_errors(scene, replace(again, dropped=lost), film, limit_mm, log_room)
     doubtful, decisive = doubtful_marks(scene, best, film, log_odds)
-    dropped = list(best.dropped)
     if doubtful:
-        dropped += [(row, int(best.image[row])) for row in doubtful]
+        dropped = (*best.dropped, *((row, int(best.image[row])) for row in doubtful))
         smaller = without(scene, best, film, doubtful, log_room)
         if smaller is None:
             return answer.failed("too few marks without doubt")
-        best = drop_gross_errors(scene, replace(smaller, dropped=tuple(dropped)), film, limit_mm, log_room)
+        best = drop_gross_errors(scene, replace(smaller, dropped=dropped), film, limit_mm, log_room)
         decisive = doubtful_marks(scene, best, film, log_odds)[1]
     missing = what_is_missing(scene, best)
     if missing:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rsa_vision.identify.film_model import GAP_MM, Scene
+from rsa_vision.identify.film_model import FILM, GAP_MM, Scene
 from rsa_vision.identify.focus_search import NEAR_MM, find_foci
 from rsa_vision.identify.grids import find_grids
 from rsa_vision.settings import Limits
@@ -18,6 +18,7 @@ from rsa_vision.types import Float, Int
 LARGEST_GAP_MM: Final = 45.0
 FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than allowed, to say `focus-far` rather than `not found`
 WEIGHED: Final = 10  # hypotheses that are fitted
+OVERLAP: Final = 0.5  # of the fiducial marks must lie on others after a move that could be mistaken
 
 _Place = tuple[Float, Float, Float, Int]  # film from plane (A, b), focus, image of every mark
 
@@ -94,3 +95,23 @@ def _start(scene: Scene, choice: Sequence[_Place]) -> Float | None:
     stretch = 1 + gap / foci[:, 2].mean()
     b = np.mean([m - A @ a / stretch for m, a in zip(middle, away, strict=True)], axis=0)
     return np.concatenate([(A / stretch).ravel(), b, [gap, 0, 0], foci.ravel()])
+
+
+def moved_by_a_mark(scene: Scene, parameters: Float) -> list[Float]:
+    """Return the hypotheses that take the fiducial grid for the same grid moved by a row or column, cage and foci as a whole.
+
+    A cage with rows and columns hidden looks like itself, moved, with others hidden: what is found must be weighed against that.
+    """
+    mine = scene.fiducial & (scene.focus == 0)
+    points = scene.xyz_mm[mine, :2]
+    moves = (points[None] - points[:, None]).reshape(-1, 2)
+    moves = np.unique(np.round(moves[np.abs(moves).max(axis=1) > 1], 3), axis=0)
+    found = []
+    for move in moves:
+        landed = np.hypot(*(points[:, None] + move - points[None]).transpose(2, 0, 1)).min(axis=1) < 2.0
+        if landed.mean() > OVERLAP:
+            start = parameters.copy()
+            start[4:6] -= parameters[:4].reshape(2, 2) @ move
+            start[FILM:] += np.tile([*move, 0.0], len(scene.foci))
+            found.append(start)
+    return found

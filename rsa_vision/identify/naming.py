@@ -23,6 +23,7 @@ SLACK_MM: Final = (0.004, 0.08)  # of film, scanner and cage, each coordinate; S
 USUAL_SLACK_MM: Final = 0.02  # weighs like USUAL_COUNT coordinates
 USUAL_COUNT: Final = 6
 STAGES_MM: Final = (0.6, 0.15)  # slack while the model settles
+NEAR_MM: Final = 1.0  # images further apart than this are never one
 LEAST_GAP_MM: Final = -0.1  # the film lies behind the plane: with the foci exchanged it would lie before
 GATE: Final = 16.0  # squared distance in sigma
 
@@ -98,25 +99,39 @@ def _assign(gain: Float) -> Int:
 
 
 def _share(scene: Scene, parameters: Float, images: FilmImages, gain: Float, image: Int, slack_mm: float) -> Int:
-    """Let marks whose images coincide share one, and take away an image that may be two melted into one."""
+    """Let marks whose images coincide share one."""
     place = project(scene, parameters)
-    image = image.copy()
-    taken = image.copy()
+    shared = image.copy()
     for row in np.flatnonzero(scene.own & (image < 0)):
+        apart = np.hypot(*(place - place[row]).T)
+        for other in np.flatnonzero((apart < NEAR_MM) & (image >= 0)):
+            d = image[other]
+            if apart[other] < _noise(images, d, slack_mm) and gain[row, d] > 0:  # off by half of it if both were there
+                shared[row] = d
+    return shared
+
+
+def _noise(images: FilmImages, image: int, slack_mm: float) -> float:
+    return float(np.sqrt(np.trace(images.covariance_mm2[image]) / 2 + slack_mm**2))
+
+
+def melted_images(scene: Scene, naming: Naming, images: FilmImages) -> Int:
+    """Find named images that may be two in one: another mark should show one as near as it is wide, and does not."""
+    parameters = naming.fit.parameters
+    place = project(scene, parameters)
+    found = []
+    for row in np.flatnonzero(scene.own & (naming.image < 0)):
         focus = parameters[FILM + 3 * scene.focus[row] + 2]
         width = 1.1 * scene.size_mm[row] * focus / (focus - scene.xyz_mm[row, 2])
         apart = np.hypot(*(place - place[row]).T)
-        for other in np.flatnonzero((apart < width) & (taken >= 0)):
-            d = taken[other]
-            noise = np.sqrt(np.trace(images.covariance_mm2[d]) / 2 + slack_mm**2)
-            if apart[other] < noise and gain[row, d] > 0:  # off by half of it if both were there
-                image[row] = d
-            elif scene.shape[row] == scene.shape[other]:
-                image[other] = -1
-    return image
+        near = (apart < width) & (naming.image >= 0) & (scene.shape == scene.shape[row])
+        found += [
+            naming.image[other] for other in np.flatnonzero(near) if apart[other] > _noise(images, naming.image[other], naming.slack_mm)
+        ]
+    return np.unique(np.array(found, dtype=np.int64))
 
 
-def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float) -> Naming | None:
+def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float, *, banned: Int | None = None) -> Naming | None:
     """Name the images under one hypothesis.
 
     Parameters
@@ -127,6 +142,8 @@ def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float) 
     images : FilmImages
     log_room : float
         Logarithm of the area and the range of rotations (mm2 rad) in which the film may lie.
+    banned : ndarray of int, optional
+        Images that are not to be named.
 
     Returns
     -------
@@ -141,10 +158,13 @@ def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float) 
     for stage in (*STAGES_MM, None, None, None):
         slack = stage if stage is not None else slack
         gain = gains(scene, parameters, images, looks, slack)
+        if banned is not None:
+            gain[:, banned] = -np.inf
         named = _assign(gain)
         if stage is None:
             gain = _no_parts(scene, parameters, images, gain, named)
-            named = _share(scene, parameters, images, gain, _assign(gain), slack)
+            named = _assign(gain)
+        named = _share(scene, parameters, images, gain, named, slack)
         if (named[scene.own] >= 0).sum() < 6:
             return None
         settled = stage is None and fitted is not None and np.array_equal(named, image)
