@@ -183,8 +183,8 @@ def _pair(table: Readings, bundle: RayBundle, mm_per_px: Mapping[int, float], st
 def _read(film: Film, focus: int | None, pitch_mm: tuple[float, float] | None, study: Study) -> FilmReading:
     rows, cols = film.values.shape
     limit = study.limits.false_detections_per_film
-    found = detect_markers(film.values, bits=film.bits, response=study.response, false_detections=limit)
-    return FilmReading(film.path, focus, (rows, cols), film.bits, pitch_mm, film.pitch_source, found.response, found.images)
+    found = detect_markers(film.values, bits=film.bits, response=study.response, false_detections=limit).images
+    return FilmReading(film.path, focus, (rows, cols), film.bits, pitch_mm, film.pitch_source, study.response, found)
 
 
 def _nominal(study: Study, cage: Cage) -> dict[int, tuple[float, float, float]]:

@@ -36,7 +36,7 @@ class FilmReading:
         (row, column) pitch as used; None with calibrated cameras, which need none.
     pitch_source : str
     response : str
-        Film response as set or found.
+        As set: `auto` leaves it to the film.
     images : MarkerImages
     """
 

@@ -21,6 +21,7 @@ COLOURS: Final = ("#0a9bff", "#ff8000", "#b45cf0", "#4caf50")  # of the foci; th
 MOST_PICTURED: Final = 60  # examinations with pictures; of more, those that are not ok come first
 SYMBOL_SHARE: Final = 1 / 110  # size of a symbol on the longest side of a film
 LABEL_SHARE: Final = 0.06  # of a film's width, for a label
+RUN_KEYS: Final = ("source", "cage", "calibration", "start", "end", "rsa_vision", "host", "system", "python")
 PLOT_PX: Final = (460, 330)
 LONGEST_ARROW: Final = 0.13  # of the plot's width
 
@@ -53,7 +54,7 @@ def write_report(out: Path) -> Path:
     cage = _cage(run)
     sections = [_section(out, exam, tables, cage, index in pictured) for index, exam in enumerate(exams)]
     page = environment.get_template("report.html").render(
-        run=run,
+        run={**dict.fromkeys(RUN_KEYS), **run},
         exams=sections,
         counts={status: sum(exam["status"] == status for exam in exams) for status in ("ok", "review", "failed")},
         reasons=REASONS,

@@ -64,7 +64,7 @@ def count_detections(exams: list[RenderedExamination], monkeypatch: pytest.Monke
 
     def detect(values: Any, **_: Any) -> Any:
         calls.append(content(values))
-        return SimpleNamespace(images=known.get(calls[-1], MarkerImages.empty()), response="density")
+        return SimpleNamespace(images=known.get(calls[-1], MarkerImages.empty()))
 
     monkeypatch.setattr("rsa_vision.examination.detect_markers", detect)
     return lambda: len(calls)

@@ -38,7 +38,7 @@ def two_images(monkeypatch: pytest.MonkeyPatch) -> MarkerImages:
         snr=np.array([40.0, 20.0]),
         flags=np.array([0, MarkerFlag.EDGE | MarkerFlag.SATURATED]),
     )
-    monkeypatch.setattr("rsa_vision.detect.detect_markers", lambda values, **_: SimpleNamespace(images=images, response="linear"))
+    monkeypatch.setattr("rsa_vision.detect.detect_markers", lambda values, **_: SimpleNamespace(images=images))
     return images
 
 
