@@ -49,7 +49,7 @@ def what_is_missing(scene: Scene, naming: Naming) -> str:
 def _breadth(points: Float) -> float:
     """Return the root mean square distance of points from their best line."""
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return float(np.hypot(*singular[1:3]) / np.sqrt(len(points)))
+    return float(np.linalg.norm(singular[1:]) / np.sqrt(len(points)))
 
 
 def impossible_stretch(naming: Naming) -> str:

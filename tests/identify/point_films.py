@@ -39,6 +39,24 @@ class FilmTruth:
     images: MarkerImages
     shape: tuple[int, int]
     source: list[tuple]  # (kind, focus, role, number) of every image
+    place_px: dict[tuple[int, str, int], np.ndarray]  # true place of every mark that the film shows
+    slack_px: float
+
+    def errors(self, assignments: object) -> list[tuple]:
+        """Return the marks whose image does not lie where the mark is, within six sigma."""
+        wrong = []
+        for focus, marks in assignments.items():  # type: ignore[attr-defined]
+            for (role, number), i in marks.items():
+                place = self.place_px.get((focus, role, number), np.full(2, np.nan))
+                sigma = np.hypot(np.sqrt(np.trace(self.images.covariance_px2[i]) / 2), self.slack_px)
+                if not np.hypot(*(self.images.position_px[i] - place)) < 6 * sigma:
+                    wrong.append((focus, role, number, self.source[i]))
+        return wrong
+
+    def visible(self, focus: int, role: str) -> int:
+        """Return how many marks of a focus have an image."""
+        names = {name[1:4] for name in self.source} | {other[1:4] for name in self.source for other in name[4:]}
+        return sum(name[:2] == (focus, role) and name in self.place_px for name in names)
 
 
 def _hit(point: np.ndarray, focus: np.ndarray, origin: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -82,7 +100,7 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: np.random.Genera
         xy = distort @ (rotation @ np.array([q @ u, q @ v]))
         return np.array([cols / 2, rows / 2]) + xy * flip
 
-    px, shape, angle, radius, source = [], [], [], [], []
+    px, shape, angle, radius, source, places = [], [], [], [], [], {}
 
     def add(point: np.ndarray, kind: str, direction: float, size: float, name: tuple) -> None:
         if -20 < point[0] < cols + 20 and -20 < point[1] < rows + 20:
@@ -102,6 +120,8 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: np.random.Genera
             hidden |= {(role, int(n)) for n in rng.choice(candidates, min(e.missing, len(candidates)), replace=False)}
         for m in cage.mark:
             xyz = np.array(m.xyz, float)
+            if m in own:
+                places[focus, m.role, m.number] = to_px(xyz, f)
             if (xyz - origin) @ normal < -1 or (m in own and (m.role, m.number) in hidden):
                 continue
             at = to_px(xyz, f)
@@ -155,7 +175,7 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: np.random.Genera
         np.zeros(len(position), np.int64),
     )
     order = rng.permutation(np.flatnonzero(keep))
-    return FilmTruth(images.rows(order), (rows, cols), [named[i] for i in order])
+    return FilmTruth(images.rows(order), (rows, cols), [named[i] for i in order], places, e.slack_mm / e.pitch_mm)
 
 
 def random_exposure(rng: np.random.Generator, cage: Cage, **fixed: object) -> Exposure:
