@@ -1,0 +1,177 @@
+"""Marker images of one film: tantalum balls, pointed pins and tees, without knowing the cage.
+
+Nothing about the film is taken for granted: polarity, blur, attenuation (with it the bend of the film curve) and noise are estimated from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.candidates import Candidates, find_candidates
+from rsa_vision.detect.find import (
+    MISFIT,
+    STRENGTH,
+    Optics,
+    estimate_optics,
+    find_tees,
+    first_look,
+    misfit,
+    settle_tees,
+    significance,
+    significance_limit,
+)
+from rsa_vision.detect.needles import NeedleFit, needle_image
+from rsa_vision.detect.noise import NoiseModel, estimate_noise
+from rsa_vision.detect.resolve import resolve_balls, strong_enough
+from rsa_vision.flags import MarkerFlag
+from rsa_vision.types import Bool, Float, MarkerImages
+
+__all__ = ["Detection", "detect_markers"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection:
+    """What was found on one film, and how the film is.
+
+    Attributes
+    ----------
+    images : MarkerImages
+    dark_markers : bool
+        Markers have lower values than their surroundings.
+    optics : Optics
+        Blur (with the pixel's own) and attenuation.
+    noise : NoiseModel
+    """
+
+    images: MarkerImages
+    dark_markers: bool
+    optics: Optics
+    noise: NoiseModel
+
+
+def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", false_detections: float = 0.1) -> Detection:
+    """Find and measure all marker images of a film.
+
+    Parameters
+    ----------
+    values : ndarray of shape (rows, cols)
+        uint8 or uint16.
+    bits : int
+        Significant bits.
+    response : str
+        ``auto``, ``density``, ``transmission``, ``linear`` or ``log``. The model takes the bend of the response from the film (it shows in the
+        profiles as more or less attenuation), so this is a statement about the film, not a switch; it is kept for ``run.json``.
+    false_detections : float
+        Expected number of marker images on a film that are noise alone.
+
+    Returns
+    -------
+    Detection
+    """
+    noise = estimate_noise(values, bits)
+    candidates = find_candidates(values, STRENGTH, noise)
+    seeds = first_look(values, candidates, noise)
+    found: list[tuple[float, Detection]] = []
+    for sign in _polarities(seeds, candidates):
+        found.append(_one_polarity(values, bits, sign, seeds, candidates, noise, false_detections))
+    return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
+
+
+def _polarities(seeds: BallFits, candidates: Candidates) -> list[int]:
+    """Signs of depth worth looking at; both only where neither is clearly the markers'."""
+    weight = {
+        sign: float(np.minimum(significance(seeds), 50.0)[np.sign(seeds.depth) == sign].sum())
+        + 5.0 * float((np.sign(candidates.junctions[:, 4]) == -sign).sum())
+        for sign in (-1, 1)
+    }
+    best = max(weight, key=lambda sign: weight[sign])
+    if weight[best] == 0:
+        return []
+    return [best] if weight[-best] < 0.15 * weight[best] else [best, -best]
+
+
+def _one_polarity(
+    film: NDArray[Any], bits: int, sign: int, seeds: BallFits, candidates: Candidates, noise: NoiseModel, false_detections: float
+) -> tuple[float, Detection]:
+    seeds = seeds.rows(np.sign(seeds.depth) == sign)
+    junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
+    same = np.sign(candidates.strength) == -sign
+    mine = Candidates(
+        candidates.position_px[same], candidates.radius_px[same], candidates.strength[same], candidates.roundness[same], junctions
+    )
+    optics = estimate_optics(film, seeds, noise)
+    tees, tee_optics = settle_tees(film, find_tees(film, junctions, optics, noise), junctions, optics, noise)
+    tees = [fit for fit in tees if np.sign(fit.depth) == sign]
+
+    def tee_images(cols: Float, rows: Float) -> Float:
+        total = np.zeros(cols.shape)
+        middle = np.array([cols.mean(), rows.mean()])
+        reach = float(np.hypot(np.ptp(cols), np.ptp(rows))) / 2
+        for t in tees:
+            if np.hypot(*(t.position_px - middle)) < reach + 1.3 * t.shape.length_px + 10:
+                dx, dy = (cols - t.position_px[0]).ravel(), (rows - t.position_px[1]).ravel()
+                total += needle_image(dx, dy, t, tee_optics.sigma_px, tee_optics.mu_px).reshape(cols.shape)
+        return total
+
+    balls, touching = resolve_balls(film, mine, seeds, optics, noise, tee_images if tees else None)
+    limit = significance_limit(film.size, 2.5, false_detections)
+    keep = strong_enough(balls, limit) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees)
+    balls, touching = balls.rows(keep), touching[keep]
+    images = _table(film, bits, balls, touching, tees, noise)
+    evidence = float(np.minimum(images.snr, 50.0).sum())
+    return evidence, Detection(images, sign < 0, optics, noise)
+
+
+def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
+    """Say which balls are left-overs of the thick ends of tees."""
+    out = np.zeros(len(balls.depth), bool)
+    for t in tees:
+        dx, dy = (balls.position_px - t.position_px).T
+        for angle, depth in zip(t.angles, t.depths, strict=True):
+            c, s = np.cos(angle), -np.sin(angle)
+            along, across = dx * c + dy * s, -dx * s + dy * c
+            on = (along > -2) & (along < t.shape.length_px + t.shape.half_width_px) & (np.abs(across) < t.shape.half_width_px + 1.5)
+            out |= on & (np.abs(balls.depth) < 0.5 * abs(depth))
+    return out
+
+
+def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees: list[NeedleFit], noise: NoiseModel) -> MarkerImages:
+    """Put balls and tees into one table, film order (row by row), with flags."""
+    full = float(2**bits - 1)
+    n, m = len(balls.depth), len(tees)
+    position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
+    core_n = np.pi * (balls.radius_px + 1) ** 2
+    # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
+    excess = np.where(balls.chi2_core > 1 + 3 * np.sqrt(2 / core_n), balls.chi2_core, 1.0)
+    covariance = np.concatenate(
+        [balls.covariance[:, :2, :2] * excess[:, None, None], np.array([t.covariance_px2 * _excess(t) for t in tees]).reshape(-1, 2, 2)]
+    )
+    radius = np.concatenate([balls.radius_px, [t.shape.half_width_px for t in tees]])
+    depth = np.abs(np.concatenate([balls.depth, [t.depth for t in tees]]))
+    background = np.concatenate([balls.background, [t.background for t in tees]])
+    flags = np.zeros(n + m, np.int64)
+    reach = np.concatenate([balls.radius_px + 1, [t.shape.length_px for t in tees]])
+    edge = (position < reach[:, None]).any(1) | (position[:, 0] > film.shape[1] - 1 - reach) | (position[:, 1] > film.shape[0] - 1 - reach)
+    flags[edge] |= MarkerFlag.EDGE
+    valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in tees]])
+    flags[(valid < 0.999) & ~edge] |= MarkerFlag.SATURATED
+    flags[valid < 0.8] |= MarkerFlag.CLIPPED
+    flags[:n][touching] |= MarkerFlag.OVERLAP
+    poor = np.concatenate([misfit(balls, noise), [t.misfit for t in tees]]) > 0.6 * MISFIT
+    flags[poor] |= MarkerFlag.POOR_FIT
+    angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
+    shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
+    snr = depth / np.sqrt(noise.variance_at(background))
+    table = MarkerImages(position, covariance, shape, radius, angle, depth / full, snr, flags)
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1]))))
+
+
+def _excess(fit: NeedleFit) -> float:
+    return fit.chi2_core if fit.chi2_core > 1 + 3 * np.sqrt(2 / max(fit.n_core, 1)) else 1.0
+
+

@@ -1,0 +1,213 @@
+"""Fits of the blurred-ball model, many candidates at once: weighted Gauss-Newton on centre, radius, depth and a quadratic background."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.patches import Patches
+from rsa_vision.detect.profiles import BallTable, ball_table
+from rsa_vision.types import Bool, Float
+
+RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; the issue's range is 2.5 to 12
+_STEPS = 12
+_CONVERGED_PX = 2e-4
+_MAX_STEP_PX = 0.7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BallFits:
+    """Fits of one batch of candidates.
+
+    Attributes
+    ----------
+    position_px : ndarray of shape (n, 2)
+        (col, row) on the film.
+    radius_px, depth : ndarray of shape (n,)
+        Depth in film values; the sign tells the polarity (negative: darker than the background).
+    covariance : ndarray of shape (n, 4, 4)
+        Of col, row, radius and depth, for the film's noise with its correlation between pixels.
+    chi2_core, chi2_ring : ndarray of shape (n,)
+        Mean squared residual in units of the noise variance, under the ball (to one blur beyond the rim) and around it.
+    explained : ndarray of shape (n,)
+        Fraction of the excess variance under the ball, over a background without ball, that the ball explains (1: all).
+    valid_fraction : ndarray of shape (n,)
+        Part of the pixels under the ball that were neither masked nor outside the film.
+    background : ndarray of shape (n,)
+        Background value at the centre.
+    converged : ndarray of bool, shape (n,)
+    """
+
+    position_px: Float
+    radius_px: Float
+    depth: Float
+    covariance: Float
+    chi2_core: Float
+    chi2_ring: Float
+    explained: Float
+    valid_fraction: Float
+    background: Float
+    converged: Bool
+
+    def rows(self, index: Any) -> BallFits:
+        """Return the fits that ``index`` selects."""
+        return BallFits(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+def join(parts: list[BallFits]) -> BallFits:
+    """Concatenate batches."""
+    return BallFits(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(BallFits)))
+
+
+def half_size(radius_px: float, sigma_px: float) -> int:
+    """Return the half side of a window that holds a ball and enough background to tell it from its curvature."""
+    return int(np.ceil(1.9 * radius_px + 3.0 * sigma_px + 2.0))
+
+
+def polynomial(axis_scale: float, dx: Float, dy: Float) -> Float:
+    """Return the six monomials of a quadratic surface on a new last axis, scaled to about one at the rim of the window."""
+    u, v = dx / axis_scale, dy / axis_scale
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+
+
+def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, sigma_px: float, mu_px: float) -> Float:
+    """Return the blurred opacity (0..1) of balls at these distances from their centres.
+
+    Parameters
+    ----------
+    film_dx, film_dy : ndarray of shape (n, ...)
+        Offsets of the pixels from the centres.
+    radius_px : ndarray of shape (n,)
+    sigma_px, mu_px : float
+        Blur and attenuation.
+
+    Returns
+    -------
+    ndarray of shape (n, ...)
+    """
+    table = ball_table(round(mu_px * sigma_px, 3))
+    return table.evaluate(np.hypot(film_dx, film_dy) / sigma_px, radius_px / sigma_px)[0]
+
+
+def fit_balls(
+    patches: Patches, start_px: Float, start_radius_px: Float, sigma_px: float, mu_px: float, noise: NoiseModel, extra: Float | None = None, *, quick: bool = False
+) -> BallFits:
+    """Fit a ball in every window.
+
+    Parameters
+    ----------
+    patches : Patches
+    start_px : ndarray of shape (n, 2)
+        (col, row) on the film.
+    start_radius_px : ndarray of shape (n,)
+    sigma_px, mu_px : float
+        Blur (standard deviation) and attenuation of the film at hand.
+    noise : NoiseModel
+    extra : ndarray of shape (n, s, s), optional
+        Images of neighbours, in film values, to be subtracted first.
+    quick : bool
+        For a first look: half the steps, and covariances as if the noise were white.
+
+    Returns
+    -------
+    BallFits
+    """
+    parts = []
+    for begin in range(0, len(start_px), 64):  # batches that stay in the cache
+        part = slice(begin, begin + 64)
+        chunk = Patches(patches.values[part], patches.valid[part], patches.corner_px[part])
+        more = None if extra is None else extra[part]
+        parts.append(_fit_batch(chunk, start_px[part], start_radius_px[part], sigma_px, mu_px, noise, more, quick))
+    return join(parts)
+
+
+def _fit_batch(
+    patches: Patches, start_px: Float, start_radius_px: Float, sigma_px: float, mu_px: float, noise: NoiseModel, extra: Float | None, quick: bool
+) -> BallFits:
+    n, size = len(start_px), patches.size
+    half = size // 2
+    table = ball_table(round(mu_px * sigma_px, 3))
+    data = patches.values if extra is None else patches.values - extra
+    data = data.reshape(n, -1)
+    valid = patches.valid.reshape(n, -1).astype(np.float64)
+    axis = np.arange(size, dtype=np.float64)
+    grid_c, grid_r = (g.ravel() for g in np.meshgrid(axis, axis))
+    surface = polynomial(half, grid_c - half, grid_r - half)
+    local = start_px - patches.corner_px
+    low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px, half - sigma_px)
+    radius = np.clip(start_radius_px, low, high)
+    weight = valid / noise.variance_at(patches.values.reshape(n, -1).mean(1))[:, None]
+    jac = np.empty((n, size * size, 10))
+    jac[:, :, 4:] = surface
+    theta = np.zeros((n, 7))
+    converged = np.zeros(n, bool)
+    model = data
+    for step in range(_STEPS // 2 if quick else _STEPS):
+        value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px)
+        jac[:, :, 3] = value
+        if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
+            theta = _solve(jac[:, :, 3:], weight, data)
+        depth = theta[:, :1]
+        jac[:, :, 0], jac[:, :, 1], jac[:, :, 2] = -depth * dx, -depth * dy, depth * slope_r
+        model = np.einsum("npk,nk->np", jac[:, :, 3:], theta)
+        if step in (2, 5):  # the variance follows the expected value once the model is near
+            weight = valid / noise.variance_at(model if extra is None else model + extra.reshape(n, -1))
+        delta = _solve(jac, weight, data - model, damping=1e-6)
+        scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(delta[:, :3]).max(1), 1e-12))[:, None]
+        local = np.clip(local + scale * delta[:, :2], 1.0, size - 2.0)
+        radius = np.clip(radius + (scale * delta[:, 2:3])[:, 0], low, high)
+        theta = theta + scale * delta[:, 3:]
+        converged = np.abs(delta[:, :2]).max(1) < _CONVERGED_PX * 10
+        if (np.abs(delta[:, :3]) < _CONVERGED_PX).all():
+            break
+    value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px)
+    jac[:, :, 3] = value
+    theta = _solve(jac[:, :, 3:], weight, data)
+    depth = theta[:, :1]
+    jac[:, :, 0], jac[:, :, 1], jac[:, :, 2] = -depth * dx, -depth * dy, depth * slope_r
+    residual = data - np.einsum("npk,nk->np", jac[:, :, 3:], theta)
+    weighted = jac * weight[:, :, None]
+    covariance = np.linalg.pinv(np.matmul(weighted.transpose(0, 2, 1), jac), hermitian=True)[:, :4]
+    if not quick:
+        influence = np.matmul(covariance, (jac * np.sqrt(weight)[:, :, None]).transpose(0, 2, 1)).reshape(n, 4, size, size)
+        covariance = np.stack([influence_covariance(one, noise.correlation) for one in influence])
+    distance = np.hypot(grid_c - local[:, :1], grid_r - local[:, 1:])
+    core = distance < (radius + sigma_px)[:, None]
+    square = weight * residual**2
+    core_n = np.maximum((core * valid).sum(1), 1.0)
+    chi2_core = (square * core).sum(1) / core_n
+    chi2_ring = (square * ~core).sum(1) / np.maximum((~core * valid).sum(1) - 10, 1.0)
+    raised = weight * (residual + depth * value) ** 2  # over the fitted background, as if there were no ball
+    return BallFits(
+        position_px=local + patches.corner_px,
+        radius_px=radius,
+        depth=theta[:, 0],
+        covariance=covariance[:, :, :4],
+        chi2_core=chi2_core,
+        chi2_ring=chi2_ring,
+        explained=1.0 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
+        valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
+        background=theta[:, 1],
+        converged=converged,
+    )
+
+
+def _ball(table: BallTable, grid_c: Float, grid_r: Float, local: Float, radius: Float, sigma_px: float) -> tuple[Float, Float, Float, Float]:
+    dx, dy = grid_c - local[:, :1], grid_r - local[:, 1:]
+    rho = np.hypot(dx, dy)
+    value, slope, slope_r = table.evaluate(rho / sigma_px, radius / sigma_px)
+    slope = slope / (sigma_px * np.maximum(rho, 1e-9))
+    return value, slope * dx, slope * dy, slope_r / sigma_px
+
+
+def _solve(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
+    weighted = jac * weight[:, :, None]
+    normal = np.matmul(weighted.transpose(0, 2, 1), jac)
+    right = np.einsum("npk,np->nk", weighted, target)
+    scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
+    normal = normal / (scale[:, :, None] * scale[:, None, :])
+    normal[:, np.arange(jac.shape[2]), np.arange(jac.shape[2])] += damping
+    return np.linalg.solve(normal, (right / scale)[:, :, None])[:, :, 0] / scale

@@ -1,0 +1,144 @@
+"""Where marker images may be: a cheap multi-scale filter over the film in bands, recall first.
+
+Differences of Gaussians on a pyramid that starts at half resolution, in units of the local spread of the same filter (so that trabeculae raise the
+threshold where they are, and nowhere else). Both polarities come out of one pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.junctions import find_junctions
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.types import Float
+
+BAND = 1024  # rows at full resolution that are in memory as float32 at once
+MARGIN = 128  # overlap of bands; more than the reach of the coarsest filter
+BLOCK = 32  # side of the blocks of one pyramid level over which the spread is measured
+# (pyramid level, inner sigma, outer sigma in pixels of that level, radius in film pixels that answers best)
+SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
+JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Local extrema of the filters.
+
+    Attributes
+    ----------
+    position_px : ndarray of shape (n, 2)
+        (col, row).
+    radius_px : ndarray of shape (n,)
+        Radius that the answering filter suits best.
+    strength : ndarray of shape (n,)
+        Filter answer in units of its local spread; positive for marks darker than their surroundings, negative for brighter ones.
+    roundness : ndarray of shape (n,)
+        Ratio of the smaller to the larger curvature at the extremum: 1 round, 0 a ridge.
+    junctions : ndarray of shape (m, 5)
+        Points where three arms may meet, as :func:`rsa_vision.detect.junctions.find_junctions`.
+    """
+
+    position_px: Float
+    radius_px: Float
+    strength: Float
+    roundness: Float
+    junctions: Float
+
+
+def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> Candidates:
+    """Find local extrema of the multi-scale filter.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    threshold : float
+        Least strength, in units of the local spread.
+    noise : NoiseModel
+        Its smallest variance is what the spread is at least taken for: saturated and blank areas have none of their own.
+
+    Returns
+    -------
+    Candidates
+        Strongest of neighbouring extrema first; both polarities.
+    """
+    found: list[Float] = []
+    junctions: list[Float] = []
+    rows = film.shape[0]
+    for start in range(0, rows, BAND):
+        top, bottom = max(0, start - MARGIN), min(rows, start + BAND + MARGIN)
+        top -= top % 8
+        band = film[top:bottom]
+        stop = start + BAND if start + BAND < rows else rows + BAND
+        for into, table in zip((found, junctions), _band_extrema(band, threshold, noise), strict=True):
+            table[:, 1] += top
+            into.append(table[(table[:, 1] >= start) & (table[:, 1] < stop)])
+    table = np.concatenate(found)
+    table = table[np.argsort(-np.abs(table[:, 3]))]
+    return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], np.concatenate(junctions))
+
+
+def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tuple[Float, Float]:
+    pad = (-band.shape[0] % 8, -band.shape[1] % 8)
+    if any(pad):
+        band = cv2.copyMakeBorder(band, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
+    level_images: dict[int, NDArray[Any]] = {}
+    image = cv2.resize(band, (band.shape[1] // 2, band.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+    for level in (1, 2, 3):
+        level_images[level] = image
+        image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    out = [np.zeros((0, 5))]
+    junctions = np.zeros((0, 5))
+    for level, inner, outer, radius in SCALES:
+        source = level_images[level]
+        # outer minus inner: positive where the mark is darker than its surroundings
+        answer = cv2.GaussianBlur(source, (0, 0), outer) - cv2.GaussianBlur(source, (0, 0), inner)
+        limit = threshold * cv2.resize(_local_spread(answer, _white_spread(noise, level, inner, outer)), (answer.shape[1], answer.shape[0]), interpolation=cv2.INTER_LINEAR)
+        out.append(_extrema(answer, limit, level, radius, threshold))
+        if (level, radius) == JUNCTION_SCALE:
+            junctions = find_junctions(answer, limit, level)
+    return np.concatenate(out), junctions
+
+
+def _extrema(answer: NDArray[Any], limit: NDArray[Any], level: int, radius: float, threshold: float) -> Float:
+    high = cv2.dilate(answer, np.ones((3, 3), np.uint8))
+    low = cv2.erode(answer, np.ones((3, 3), np.uint8))
+    peak = ((answer == high) & (answer > limit)) | ((answer == low) & (answer < -limit))
+    peak[0] = peak[-1] = False
+    peak[:, 0] = peak[:, -1] = False
+    row, col = np.nonzero(peak)
+    if len(row) == 0:
+        return np.zeros((0, 5))
+    centre = answer[row, col].astype(np.float64)
+    left, right, up, down = (answer[row + dr, col + dc] for dr, dc in ((0, -1), (0, 1), (-1, 0), (1, 0)))
+    dxx, dyy = left + right - 2 * centre, up + down - 2 * centre
+    dxy = (answer[row + 1, col + 1] + answer[row - 1, col - 1] - answer[row + 1, col - 1] - answer[row - 1, col + 1]) / 4
+    mean, spread_xy = (dxx + dyy) / 2, np.hypot((dxx - dyy) / 2, dxy)
+    roundness = (np.abs(mean) - spread_xy) / np.maximum(np.abs(mean) + spread_xy, 1e-12)
+    shift_c = np.clip((left - right) / (2 * np.where(dxx == 0, 1, dxx)), -0.5, 0.5)
+    shift_r = np.clip((up - down) / (2 * np.where(dyy == 0, 1, dyy)), -0.5, 0.5)
+    size = 2**level
+    position_c = (col + shift_c + 0.5) * size - 0.5
+    position_r = (row + shift_r + 0.5) * size - 0.5
+    strength = centre * threshold / np.maximum(limit[row, col], 1e-9)
+    return np.stack([position_c, position_r, np.full(len(row), radius), strength, roundness], axis=1)
+
+
+def _white_spread(noise: NoiseModel, level: int, inner: float, outer: float) -> float:
+    """Spread of a filter's answer to white noise of the film's smallest variance."""
+    gain = 1 / (4 * np.pi * inner**2) + 1 / (4 * np.pi * outer**2) - 1 / (np.pi * (inner**2 + outer**2))
+    return float(np.sqrt(noise.variance.min() * gain) / 2**level)
+
+
+def _local_spread(answer: NDArray[Any], least: float) -> NDArray[Any]:
+    """Median absolute deviation in blocks, as a standard deviation, on the grid of the blocks."""
+    n_rows, n_cols = max(1, answer.shape[0] // BLOCK), max(1, answer.shape[1] // BLOCK)
+    block_r, block_c = min(BLOCK, answer.shape[0]), min(BLOCK, answer.shape[1])
+    # every third pixel in either direction: the filter's own correlation makes the others nearly copies
+    part = np.abs(answer[: n_rows * block_r, : n_cols * block_c].reshape(n_rows, block_r, n_cols, block_c)[:, 1::3, :, 1::3])
+    middle = np.median(part.swapaxes(1, 2).reshape(n_rows, n_cols, -1), axis=2) / 0.6745
+    return np.maximum(middle, least).astype(np.float32)

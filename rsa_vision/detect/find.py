@@ -1,0 +1,357 @@
+"""From a film to its marker images: candidates, the film's own blur and attenuation, model fits, decisions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from rsa_vision.detect.balls import BallFits, fit_balls, half_size, join
+from rsa_vision.detect.candidates import Candidates, find_candidates
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles, needle_image, thick_ends
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.patches import cut
+from rsa_vision.types import Bool, Float
+
+STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
+ROUNDNESS = 0.2  # less round extrema are ridges
+COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
+SIGMAS_PX = (0.55, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.6)
+MUS_PX = (0.1, 0.25, 0.5, 1.0, 2.0)
+MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/detection.md
+EXPLAINED = 0.9
+ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
+_MOST_SEEDS = 24
+_LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """What is common to all marks of a film: blur and attenuation, per pixel."""
+
+    sigma_px: float
+    mu_px: float
+
+
+def fit_at(film: NDArray[Any], position_px: Float, radius_px: Float, optics: Optics, noise: NoiseModel, others: Any = None, *, quick: bool = False) -> BallFits:
+    """Fit balls at these places, in windows that suit their radii.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    position_px : ndarray of shape (n, 2)
+    radius_px : ndarray of shape (n,)
+    optics : Optics
+    noise : NoiseModel
+    others : callable, optional
+        ``others(i, cols, rows)``: images of the neighbours of ball ``i`` at these pixels.
+    quick : bool
+        As of :func:`rsa_vision.detect.balls.fit_balls`.
+
+    Returns
+    -------
+    BallFits
+        In the order of the positions.
+    """
+    halves = np.array([half_size(r, optics.sigma_px) for r in radius_px])
+    order, parts = [], []
+    for half in np.unique(halves):
+        index = np.nonzero(halves == half)[0]
+        patches = cut(film, position_px[index], int(half), noise)
+        extra = None
+        if others is not None:
+            grid = np.arange(patches.size)
+            extra = np.stack(
+                [
+                    others(i, *np.meshgrid(grid + corner[0], grid + corner[1]))
+                    for i, corner in zip(index, patches.corner_px.astype(np.float64), strict=True)
+                ]
+            )
+        parts.append(fit_balls(patches, position_px[index], radius_px[index], optics.sigma_px, optics.mu_px, noise, extra, quick=quick))
+        order.append(index)
+    fits = join(parts)
+    return fits.rows(np.argsort(np.concatenate(order)))
+
+
+def misfit(fits: BallFits, noise: NoiseModel) -> Float:
+    """Return the RMS residual under the ball beyond the noise, as a fraction of the depth, shape (n,)."""
+    excess = np.maximum(fits.chi2_core - 1.0, 0.0) * noise.variance_at(fits.background)
+    return np.sqrt(excess) / np.maximum(np.abs(fits.depth), 1e-9)
+
+
+def significance(fits: BallFits) -> Float:
+    """Return depth over its standard deviation, shape (n,)."""
+    return np.abs(fits.depth) / np.sqrt(np.maximum(fits.covariance[:, 3, 3], 1e-30))
+
+
+def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
+    """Say which fits look like balls: the model leaves little, and explains nearly all.
+
+    Parameters
+    ----------
+    fits : BallFits
+    noise : NoiseModel
+    slack : float
+        Above 1: more tolerant, for a first look.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    usable = (fits.valid_fraction > 0.6) & np.isfinite(fits.position_px).all(1)
+    return usable & (misfit(fits, noise) < MISFIT * slack) & (fits.explained > 1 - (1 - EXPLAINED) * slack) & (significance(fits) > 5.0)
+
+
+def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) -> BallFits:
+    """Fit every round candidate with guessed optics and keep what may be a ball.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    candidates : Candidates
+    noise : NoiseModel
+
+    Returns
+    -------
+    BallFits
+        Best first; no two nearer than a radius.
+    """
+    round_ones = candidates.roundness > ROUNDNESS
+    position, radius = candidates.position_px[round_ones], candidates.radius_px[round_ones]
+    if len(position) == 0:
+        return _no_fits()
+    guess = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
+    fits = fit_at(film, position, radius, guess, noise, quick=True)
+    fits = fits.rows(plausible(fits, noise, slack=2.5))
+    return distinct(fits, noise)
+
+
+def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:
+    """Of fits that fell on the same place keep the better one (best first)."""
+    order = np.argsort(misfit(fits, noise) + (1 - fits.explained))
+    keep: list[int] = []
+    for i in order:
+        gap = np.hypot(*(fits.position_px[keep] - fits.position_px[i]).T) if keep else np.zeros(0)
+        if not (gap < 0.5 * fits.radius_px[i]).any():
+            keep.append(int(i))
+    return fits.rows(np.array(keep, dtype=np.intp))
+
+
+def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> Optics:
+    """Estimate blur and attenuation that the best candidates of a film have in common, by maximum likelihood on a grid.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    seeds : BallFits
+    noise : NoiseModel
+
+    Returns
+    -------
+    Optics
+    """
+    if len(seeds.depth) == 0:
+        return Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
+    best = np.argsort(misfit(seeds, noise) + (1 - seeds.explained))[: 3 * _MOST_SEEDS]
+    position, radius = seeds.position_px[best], seeds.radius_px[best]
+
+    def fit(sigma: float, mu: float) -> BallFits:
+        return fit_at(film, position, radius, Optics(sigma, mu), noise, quick=True)
+
+    # whatever fits badly at every blur is no ball and has no say
+    trials = [fit(sigma, COARSE_MU_PX) for sigma in SIGMAS_PX]
+    closest = np.min([misfit(t, noise) + (1 - t.explained) for t in trials], axis=0)
+    chosen = np.argsort(closest)[:_MOST_SEEDS]
+    chosen = chosen[closest[chosen] < max(0.08, 1.5 * closest[chosen[0]])]
+    position, radius = position[chosen], radius[chosen]
+
+    def cost(fits: BallFits, sigma: float) -> float:
+        area = np.pi * (fits.radius_px + sigma) ** 2
+        return float((area * np.log(np.maximum(fits.chi2_core, 0.05))).sum())
+
+    mu = COARSE_MU_PX
+    sigma = _refine(SIGMAS_PX, [cost(t.rows(chosen), s) for s, t in zip(SIGMAS_PX, trials, strict=True)])
+    mu = _refine(MUS_PX, [cost(fit(sigma, m), sigma) for m in MUS_PX])
+    near = tuple(sigma * f for f in (0.8, 0.9, 1.0, 1.1, 1.2))
+    return Optics(_refine(near, [cost(fit(s, mu), s) for s in near]), mu)
+
+
+def _refine(grid: tuple[float, ...], costs: list[float]) -> float:
+    """Return the minimum on a grid, moved by a parabola through it and its neighbours (in the logarithm)."""
+    values = np.array(costs)
+    k = int(values.argmin())
+    if not 0 < k < len(grid) - 1:
+        return float(grid[k])
+    x = np.log(np.array(grid[k - 1 : k + 2]))
+    a, b, _ = np.polyfit(x, values[k - 1 : k + 2], 2)
+    return float(np.exp(np.clip(-b / (2 * a), x[0], x[2]))) if a > 0 else float(grid[k])
+
+
+def significance_limit(film_size: int, radius_px: float, false_detections: float) -> float:
+    """Return the depth, in standard deviations, that noise alone exceeds ``false_detections`` times on a film.
+
+    Parameters
+    ----------
+    film_size : int
+        Pixels.
+    radius_px : float
+        Smallest radius looked for; it sets the number of independent places.
+    false_detections : float
+        Expected number for the whole film.
+
+    Returns
+    -------
+    float
+    """
+    places = film_size / (np.pi * radius_px**2) * 4  # four filters
+    return float(norm.isf(min(0.5, false_detections / places)))
+
+
+def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Fit a tee at every junction of the right polarity and keep those that the model roughly describes.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    junctions : ndarray of shape (n, 5)
+        As of :func:`rsa_vision.detect.junctions.find_junctions`, one polarity.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    list of NeedleFit
+        Best first; no two nearer than half an arm. Neighbours whose arms overlap still disturb each other: see :func:`settle_tees`.
+    """
+    fits = []
+    for col, row, angle, ring, _ in junctions:
+        start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring)
+        angles = angle + np.array([0.0, np.pi / 2, -np.pi / 2])
+        fit = fit_needles(film, np.array([col, row]), angles, start, optics.sigma_px, optics.mu_px, noise, rigid=True)
+        if is_tee(fit, slack=ROUGH):
+            fits.append(fit)
+    fits.sort(key=lambda f: f.misfit + 1 - f.explained)
+    kept: list[NeedleFit] = []
+    for fit in fits:
+        if all(np.hypot(*(fit.position_px - k.position_px)) > 0.4 * k.shape.length_px for k in kept):
+            kept.append(fit)
+    return kept
+
+
+def settle_tees(film: NDArray[Any], tees: list[NeedleFit], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], Optics]:
+    """Fit tees whose arms overlap together (each with the others' images subtracted, until nothing moves), then drop what is none.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    tees : list of NeedleFit
+    junctions : ndarray of shape (n, 5)
+        Those not yet taken get a second chance once the tees beside them are known.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    list of NeedleFit, Optics
+        The optics with the attenuation that suits the arms: they are thinner than balls, and the film curve is bent.
+    """
+    if not tees:
+        return [], optics
+    for attempt in range(3):
+        tees = _round(film, tees, optics, noise, rigid=True)
+        tees = [fit for fit in tees if is_tee(fit, slack=ROUGH)]
+        if tees and attempt < 2:
+            tees += _second_chance(film, tees, junctions, optics, noise)
+    tees = [fit for fit in _round(film, tees, optics, noise) if is_tee(fit, slack=ROUGH)]
+    if not tees:
+        return [], optics
+    sample = sorted(tees, key=lambda f: f.misfit)[:8]
+
+    def cost(mu: float) -> float:
+        trial = Optics(optics.sigma_px, mu)
+        return float(sum(np.log(max(_with_neighbours(film, f, tees, trial, noise, ends=False).chi2_core, 0.05)) for f in sample))
+
+    mus = tuple(optics.mu_px * f for f in (0.25, 0.5, 0.75, 1.0, 1.35, 2.0, 4.0))
+    optics = Optics(optics.sigma_px, _refine(mus, [cost(mu) for mu in mus]))
+    tees = _round(film, _round(film, tees, optics, noise), optics, noise)
+    tees = [fit for fit in (_with_neighbours(film, fit, tees, optics, noise, ends=False) for fit in tees) if is_tee(fit)]
+    return _parallel(film, tees, optics, noise), optics
+
+
+def _parallel(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Let the arms of all tees be parallel, if the film agrees: arms that are parallel on a cage stay so on a film, nearly.
+
+    The tip is where lines along the arms meet, so what is known of their directions sharpens it. Films on which the arms are not parallel
+    (the likelihood tells) keep a direction for each.
+    """
+    if len(tees) < _LEAST_PARALLEL:
+        return tees
+    spread = np.array([np.angle(np.exp(1j * (f.angles - f.angles[0]))) for f in tees])
+    common = np.median(spread, axis=0)
+    turn = np.median([np.angle(np.exp(1j * (f.angles - common - tees[0].angles[0]))).mean() for f in tees]) + tees[0].angles[0]
+    tied = [
+        _with_neighbours(film, replace(fit, angles=turn + common), tees, optics, noise, ends=False, rigid=True) for fit in tees
+    ]
+    worse = sum(t.n_core * (t.chi2_core - f.chi2_core) / max(f.chi2_core, 1.0) for t, f in zip(tied, tees, strict=True))
+    freedom = 2 * len(tees) * noise.correlation.sum()  # two directions less for each, in noise that is correlated
+    return tied if worse < 2.0 * freedom and all(is_tee(t) for t in tied) else tees
+
+
+def _second_chance(film: NDArray[Any], tees: list[NeedleFit], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    typical = min(tees, key=lambda f: f.misfit)
+    found: list[NeedleFit] = []
+    for col, row, *_ in junctions:
+        taken = [*tees, *found]
+        if min(np.hypot(t.position_px[0] - col, t.position_px[1] - row) for t in taken) < 0.4 * typical.shape.length_px:
+            continue
+        start = replace(typical, position_px=np.array([col, row]))
+        fit = _with_neighbours(film, start, taken, optics, noise, ends=True, rigid=True)
+        apart = min(np.hypot(*(t.position_px - fit.position_px)) for t in taken) > 0.4 * typical.shape.length_px
+        if apart and is_tee(fit, slack=ROUGH):
+            found.append(fit)
+    return found
+
+
+def _round(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel, *, rigid: bool = False) -> list[NeedleFit]:
+    """Fit every tee again, each with the newest images of the others subtracted."""
+    tees = list(tees)
+    for i, fit in enumerate(tees):
+        tees[i] = _with_neighbours(film, fit, tees, optics, noise, ends=True, rigid=rigid)
+    return tees
+
+
+def _with_neighbours(film: NDArray[Any], fit: NeedleFit, tees: list[NeedleFit], optics: Optics, noise: NoiseModel, *, ends: bool, rigid: bool = False) -> NeedleFit:
+    reach = 2.4 * fit.shape.length_px + 8
+    gaps = [float(np.hypot(*(t.position_px - fit.position_px))) for t in tees]
+    near = [t for t, gap in zip(tees, gaps, strict=True) if 0.2 * fit.shape.length_px < gap < reach]  # nearer: itself
+
+    def others(cols: Float, rows: Float) -> tuple[Float, Bool]:
+        total, doubtful = np.zeros_like(cols), np.zeros(cols.shape, bool)
+        for t in near:
+            dx, dy = cols - t.position_px[0], rows - t.position_px[1]
+            total += needle_image(dx, dy, t, optics.sigma_px, optics.mu_px)
+            if not ends:
+                doubtful |= thick_ends(dx, dy, t.angles, t.shape, optics.sigma_px)
+        return total, doubtful
+
+    return fit_needles(
+        film, fit.position_px, fit.angles, fit.shape, optics.sigma_px, optics.mu_px, noise, others=others if near else None, ends=ends, rigid=rigid
+    )
+
+
+def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
+    """Say whether a fit looks like a tee: little misfit, arms square to each other, all of it on the film."""
+    if not np.isfinite(fit.misfit) or fit.significance < 6.0 or fit.valid_fraction < 0.6:
+        return False
+    turn = np.angle(np.exp(1j * (fit.angles - fit.angles[0])))
+    square = abs(turn[1] - np.pi / 2) < 0.35 and abs(turn[2] + np.pi / 2) < 0.35
+    slim = fit.shape.length_px > 2.0 * fit.shape.half_width_px
+    return square and slim and fit.misfit < 1.3 * MISFIT * slack and fit.explained > 1 - (1 - EXPLAINED) * slack
+
+
+def _no_fits() -> BallFits:
+    none = np.zeros(0)
+    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), none, none, none, none, none, np.zeros(0, bool))

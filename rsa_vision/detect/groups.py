@@ -1,0 +1,107 @@
+"""Balls whose images touch: one fit for all of them, so that their errors stay honest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, polynomial
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.detect.profiles import ball_table
+from rsa_vision.types import Float
+
+_STEPS = 25
+_CONVERGED_PX = 1e-3
+
+
+def fit_group(
+    film: NDArray[Any], start_px: Float, start_radius_px: Float, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None
+) -> BallFits:
+    """Fit several balls in one window on one background.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    start_px : ndarray of shape (k, 2)
+        (col, row).
+    start_radius_px : ndarray of shape (k,)
+    sigma_px, mu_px : float
+    noise : NoiseModel
+    others : callable, optional
+        ``others(cols, rows)``: images of neighbours outside the group, subtracted first.
+
+    Returns
+    -------
+    BallFits
+        One row a ball; figures of merit are taken under the ball, with all balls modelled.
+    """
+    k = len(start_px)
+    middle = start_px.mean(0)
+    spread = float(np.abs(start_px - middle).max())
+    half = half_size(float(start_radius_px.max()), sigma_px) + int(np.ceil(spread))
+    patch = cut(film, middle[None], half, noise)
+    corner = patch.corner_px[0].astype(np.float64)
+    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size].reshape(2, -1).astype(np.float64)
+    valid = patch.valid[0].ravel().astype(np.float64)
+    raw = patch.values[0].ravel()
+    neighbours = np.zeros_like(raw) if others is None else others(cols + corner[0], rows + corner[1])
+    data = raw - neighbours
+    local, radius = start_px - corner, np.clip(start_radius_px, RADIUS_PX[0], RADIUS_PX[1]).astype(np.float64)
+    low, high = max(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20 * sigma_px)
+    surface = polynomial(half, cols - half, rows - half)
+    table = ball_table(round(mu_px * sigma_px, 3))
+    weight = valid / noise.variance_at(raw)
+
+    def model() -> tuple[Float, Float, Float, Float]:
+        dx, dy = cols - local[:, :1], rows - local[:, 1:]
+        rho = np.hypot(dx, dy)
+        value, slope, slope_r = table.evaluate(rho / sigma_px, radius / sigma_px)
+        slope = slope / (sigma_px * np.maximum(rho, 1e-9))
+        return value, -slope * dx, -slope * dy, slope_r / sigma_px
+
+    value, d_col, d_row, d_radius = model()
+    linear = np.column_stack([*value, surface])
+    theta = weighted_least_squares(linear, weight, data, 1e-6)
+    converged = False
+    for step in range(_STEPS + 1):
+        depth = theta[:k, None]
+        jac = np.column_stack([*(depth * d_col), *(depth * d_row), *(depth * d_radius), linear])
+        residual = data - linear @ theta
+        if step == _STEPS or converged:
+            break
+        if step in (4, 10):
+            weight = valid / noise.variance_at(linear @ theta + neighbours)
+        delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 6 else 1e-7)
+        move = delta[: 3 * k].reshape(3, k)
+        scale = min(1.0, 0.5 / max(float(np.abs(move).max()), 1e-9))
+        local = local + scale * move[:2].T
+        radius = np.clip(radius + scale * move[2], low, high)
+        converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
+        value, d_col, d_row, d_radius = model()
+        linear = np.column_stack([*value, surface])
+        theta = weighted_least_squares(linear, weight, data, 1e-9)
+    covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
+    influence = (covariance[: 4 * k] @ (jac * np.sqrt(weight)[:, None]).T).reshape(4 * k, patch.size, patch.size)
+    whole = influence_covariance(influence, noise.correlation)
+    distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
+    core = distance < (radius + sigma_px)[:, None]
+    square = weight * residual**2
+    ring = valid * ~core.any(0)
+    inside = np.maximum((core * valid).sum(1), 1.0)
+    raised = weight * (residual + theta[:k, None] * value) ** 2
+    own = [[i, k + i, 2 * k + i, 3 * k + i] for i in range(k)]
+    return BallFits(
+        position_px=local + corner,
+        radius_px=radius,
+        depth=theta[:k],
+        covariance=np.stack([whole[np.ix_(index, index)] for index in own]),
+        chi2_core=(square * core).sum(1) / inside,
+        chi2_ring=np.full(k, (square * ring).sum() / max(ring.sum() - 6, 1.0)),
+        explained=1 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
+        valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
+        background=np.full(k, theta[k]),
+        converged=np.full(k, converged),
+    )

@@ -1,0 +1,330 @@
+"""Fits of pointed pins and of tees (three pins whose tips meet): a blurred cone seen from the side, or three of them with one common tip.
+
+The tip of a tapering pin fades out: the opacity near it grows with the square of the distance, so any threshold lies pixels away from it. The
+model is the opacity along the chord through a cone, blurred; the tip is a parameter of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from rsa_vision.detect.balls import polynomial
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.types import Bool, Float
+
+CELL = 0.25  # pixels between the nodes of a needle table
+GRID_W, GRID_L = 0.125, 0.5  # pixels between the shapes that have tables of their own
+_PAD = 6.0  # blur widths around the needle that a table covers
+_STEPS = 14
+_CONVERGED_PX = 5e-4
+
+
+@dataclass(frozen=True, slots=True)
+class NeedleShape:
+    """Outline of a pointed pin in pixels.
+
+    Attributes
+    ----------
+    half_width_px, length_px : float
+        At the thick end; from the tip to the thick end.
+    taper : float
+        Part of the length over which it tapers (1: a full cone).
+    """
+
+    half_width_px: float
+    length_px: float
+    taper: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NeedleFit:
+    """One fitted pin or tee.
+
+    Attributes
+    ----------
+    position_px : ndarray of shape (2,)
+        (col, row) of the tip, or of the point where the tips meet.
+    angles : ndarray of shape (k,)
+        Directions from the tip along each arm, radians, ``atan2(-drow, dcol)``.
+    shape : NeedleShape
+    depths : ndarray of shape (k,)
+        Film values, for each arm (rays cross the arms at different angles); negative: darker than the background.
+    depth, background : float
+        Their mean; film value of the background at the tip.
+    covariance_px2 : ndarray of shape (2, 2)
+    n_core : int
+        Pixels under the arms.
+    chi2_core, chi2_ring, explained, valid_fraction, misfit : float
+        As in :class:`rsa_vision.detect.balls.BallFits`; ``misfit`` is the RMS residual beyond the noise as a fraction of the depth.
+    significance : float
+        Depth over its standard deviation.
+    converged : bool
+    """
+
+    position_px: Float
+    angles: Float
+    shape: NeedleShape
+    depths: Float
+    depth: float
+    background: float
+    covariance_px2: Float
+    n_core: int
+    chi2_core: float
+    chi2_ring: float
+    explained: float
+    valid_fraction: float
+    misfit: float
+    significance: float
+    converged: bool
+
+
+@lru_cache(maxsize=256)
+def _table(half_width: float, length: float, taper: float, sigma: float, mu: float) -> tuple[Float, float, float]:
+    pad = _PAD * sigma
+    s = np.arange(-pad, length + pad + CELL, CELL)
+    p = np.arange(0.0, half_width + pad + CELL, CELL)
+    p = np.concatenate([-p[:0:-1], p])
+    # cells of a quarter pixel are averaged from finer ones only where the outline cuts them: a third in each direction suffices
+    fine_s = (s[:, None] + CELL * (np.arange(3) - 1) / 3).ravel()
+    fine_p = (p[:, None] + CELL * (np.arange(3) - 1) / 3).ravel()
+    width = half_width * np.clip(fine_s / (taper * length), 0.0, 1.0)
+    width[fine_s > length] = 0.0
+    chord = 2 * np.sqrt(np.maximum(width[:, None] ** 2 - fine_p[None, :] ** 2, 0.0))
+    opacity = (-np.expm1(-mu * chord)).reshape(len(s), 3, len(p), 3).mean((1, 3))
+    return gaussian_filter(opacity, sigma / CELL, mode="constant", truncate=5.0), float(s[0]), float(p[0])
+
+
+def _look_up(table: tuple[Float, float, float], s: Float, p: Float) -> Float:
+    values, s0, p0 = table
+    return map_coordinates(values, [(s - s0) / CELL, (p - p0) / CELL], order=1, mode="constant")
+
+
+def needle_image(dx: Float, dy: Float, fit: NeedleFit, sigma_px: float, mu_px: float) -> Float:
+    """Return the image of a fitted pin or tee, in film values over the background.
+
+    Parameters
+    ----------
+    dx, dy : ndarray
+        Offsets (col, row) of the pixels from the common tip.
+    fit : NeedleFit
+    sigma_px, mu_px : float
+
+    Returns
+    -------
+    ndarray of the shape of ``dx``
+    """
+    values = _jacobian(dx, dy, fit.angles, fit.shape, sigma_px, mu_px)[0]
+    image: Float = np.tensordot(fit.depths, values, axes=1)
+    return image
+
+
+def _jacobian(
+    dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float, mu: float
+) -> Float:
+    """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the first axis."""
+    # tables stand on a grid of shapes, shared by all needles of a film; in between the image is linear in the shape
+    off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % GRID_L
+    w, l = round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4)
+    rest = (shape.taper, round(sigma, 3), round(mu, 4))
+    base, wide, long = _table(w, l, *rest), _table(round(w + GRID_W, 4), l, *rest), _table(w, round(l + GRID_L, 4), *rest)
+    slope = (np.gradient(base[0], CELL, axis=0), np.gradient(base[0], CELL, axis=1))
+    arms = []
+    for angle in angles:
+        c, s = np.cos(angle), -np.sin(angle)
+        along, across = dx * c + dy * s, -dx * s + dy * c
+        one = _look_up(base, along, across)
+        g_s = _look_up((slope[0], *base[1:]), along, across)
+        g_p = _look_up((slope[1], *base[1:]), along, across)
+        more_w = (_look_up(wide, along, across) - one) / GRID_W
+        more_l = (_look_up(long, along, across) - one) / GRID_L
+        d_angle = g_s * -across + g_p * along  # counter-clockwise as displayed, the row axis pointing down
+        arms.append((one + off_w * more_w + off_l * more_l, g_p * s - g_s * c, -g_s * s - g_p * c, more_w, more_l, d_angle))
+    return np.array(arms).swapaxes(0, 1)
+
+
+def thick_ends(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float) -> Bool:
+    """Return the pixels that the flat thick ends reach by blur or slant (slants up to 0.5)."""
+    reach = _end_reach(shape, sigma)
+    inside = np.zeros(dx.shape, bool)
+    for angle in angles:
+        c, s = np.cos(angle), -np.sin(angle)
+        along, across = dx * c + dy * s, -dx * s + dy * c
+        inside |= (np.abs(along - shape.length_px) < reach) & (np.abs(across) < shape.half_width_px + 3 * sigma + 1)
+    return inside
+
+
+def _beyond(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float) -> Bool:
+    """Return the pixels of the thick ends and of what lies behind them."""
+    out = np.zeros(dx.shape, bool)
+    for angle in angles:
+        c, s = np.cos(angle), -np.sin(angle)
+        out |= (dx * c + dy * s > shape.length_px - _end_reach(shape, sigma)) & (np.abs(-dx * s + dy * c) < 2 * shape.half_width_px + 3 * sigma)
+    return out
+
+
+def _end_reach(shape: NeedleShape, sigma: float) -> float:
+    return 0.5 * shape.half_width_px + 2.2 * sigma
+
+
+def _support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:
+    """Pixels within ``margin`` of an arm's axis rectangle."""
+    inside = np.hypot(dx, dy) < margin
+    for angle in angles:
+        c, s = np.cos(angle), -np.sin(angle)
+        along, across = dx * c + dy * s, -dx * s + dy * c
+        inside |= (along > -margin) & (along < shape.length_px + margin) & (np.abs(across) < shape.half_width_px + margin)
+    return inside
+
+
+def fit_needles(
+    film: NDArray[Any],
+    tip_px: Float,
+    angles: Float,
+    shape: NeedleShape,
+    sigma_px: float,
+    mu_px: float,
+    noise: NoiseModel,
+    *,
+    others: Any = None,
+    ends: bool = True,
+    rigid: bool = False,
+) -> NeedleFit:
+    """Fit one pin (one angle) or tee (three).
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    tip_px : ndarray of shape (2,)
+        Start, (col, row).
+    angles : ndarray of shape (k,)
+        Start, radians.
+    shape : NeedleShape
+        Start; its taper is kept.
+    sigma_px, mu_px : float
+    noise : NoiseModel
+    others : callable, optional
+        ``others(cols, rows)`` returns the images of neighbours at these pixels, in film values, which are subtracted first, and a mask of
+        the pixels where those are not to be trusted (the thick ends of other needles).
+    ends : bool
+        The thick ends take part and the length is free. Seen from the focus at a slant the flat end of a pin is a tilted ellipse, which the
+        model does not have: it would turn the arms and so move the tip. So the last fit leaves the ends out and holds the length.
+    rigid : bool
+        The arms turn together; else each has its own direction. With ``ends`` they are equally deep, too: for a first look, while neighbours
+        still disturb.
+
+    Returns
+    -------
+    NeedleFit
+    """
+    half = int(np.ceil(shape.length_px * 1.15 + shape.half_width_px + 3 * sigma_px + 3))
+    patch = cut(film, tip_px[None], half, noise)
+    corner = patch.corner_px[0]
+    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
+    cols, rows = cols + float(corner[0]), rows + float(corner[1])
+    keep = patch.valid[0] & _support(cols - tip_px[0], rows - tip_px[1], angles, shape, 3 * sigma_px + 4.0)
+    if not ends:
+        keep &= ~_beyond(cols - tip_px[0], rows - tip_px[1], angles, shape, sigma_px)
+    cols, rows, raw = cols[keep], rows[keep], patch.values[0][keep]
+    neighbours = np.zeros_like(raw)
+    if others is not None:
+        neighbours, doubtful = others(cols, rows)
+        cols, rows, raw, neighbours = (array[~doubtful] for array in (cols, rows, raw, neighbours))
+    data = raw - neighbours
+    surface = polynomial(half, cols - tip_px[0], rows - tip_px[1])
+    weight = np.full(len(data), 1.0 / float(noise.variance_at(np.array([raw.mean()]))[0])) if len(data) else np.zeros(0)
+    k = len(angles)
+    tip, angles = tip_px.astype(np.float64).copy(), angles.astype(np.float64).copy()
+    if len(data) < 30 + 6 + 2 * k:
+        return _unfit(tip, angles, shape)
+    n_depth = 1 if rigid and ends else k
+    theta = np.zeros(n_depth + 6)
+    converged = False
+    n_shape = 2 if ends else 1
+    n_turn = 1 if rigid else k
+    n_free = 2 + n_shape + n_turn
+    for step in range(_STEPS + 1):
+        value, d_col, d_row, d_w, d_l, d_angle = _jacobian(cols - tip[0], rows - tip[1], angles, shape, sigma_px, mu_px)
+        linear = np.column_stack([*(value.sum(0, keepdims=True) if n_depth < k else value), surface])
+        if step == 0 or step == _STEPS or converged:
+            theta = weighted_least_squares(linear, weight, data)
+        depths = np.broadcast_to(theta[:n_depth], (k,)).copy()
+        residual = data - linear @ theta
+        common = [depths @ d for d in (d_col, d_row, d_w, d_l)[: 2 + n_shape]]
+        turns = depths[:, None] * d_angle
+        jac = np.column_stack([*common, *(turns.sum(0, keepdims=True) if rigid else turns), linear])
+        if step == _STEPS or converged:
+            break
+        if step in (1, 4):
+            weight = 1.0 / noise.variance_at(linear @ theta + neighbours)
+        delta = weighted_least_squares(jac, weight, residual, damping=1e-4 if step < 4 else 1e-7)
+        scale = min(1.0, 1.5 / max(np.abs(delta[:2]).max(), 1e-9), 0.15 / max(np.abs(delta[n_free - n_turn : n_free]).max(), 1e-9))
+        tip += scale * delta[:2]
+        width = float(np.clip(shape.half_width_px + np.clip(scale * delta[2], -0.5, 0.5), 0.6, 0.3 * shape.length_px))
+        longer = float(np.clip(scale * delta[3], -2.0, 2.0)) if ends else 0.0
+        shape = NeedleShape(width, float(np.clip(shape.length_px + longer, 3.0, half / 1.05)), shape.taper)
+        angles += scale * delta[n_free - n_turn : n_free]
+        theta = theta + scale * delta[n_free:]
+        converged = step > 1 and bool(np.abs(delta[:2]).max() < _CONVERGED_PX)
+        if np.hypot(*(tip - tip_px)) > 0.6 * half:
+            return _unfit(tip, angles, shape)
+    weighted = jac * weight[:, None]
+    covariance = np.linalg.pinv(weighted.T @ jac, hermitian=True)
+    influence = np.zeros((2, patch.size, patch.size))
+    influence[:, (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)] = covariance[:2] @ (weighted / np.sqrt(weight)[:, None]).T
+    depth = float(depths.mean())
+    image = depths @ value
+    core = image / depth > 0.08 * max((image / depth).max(), 1e-9) if depth else np.zeros(len(image), bool)
+    square = weight * residual**2
+    n_core = max(int(core.sum()), 1)
+    chi2_core = float(square[core].sum() / n_core)
+    ring = ~core
+    chi2_ring = float(square[ring].sum() / max(int(ring.sum()) - len(delta), 1))
+    raised = float((weight * (residual + image) ** 2)[core].sum())
+    background = float(theta[n_depth])
+    variance = float(noise.variance_at(np.array([background]))[0])
+    spread = covariance[n_free : n_free + n_depth, n_free : n_free + n_depth].mean()  # variance of the mean depth
+    full = _support_count(tip, angles, shape, sigma_px, ends)
+    return NeedleFit(
+        position_px=tip,
+        angles=angles,
+        shape=shape,
+        depths=depths,
+        depth=depth,
+        background=background,
+        covariance_px2=influence_covariance(influence, noise.correlation),
+        n_core=n_core,
+        chi2_core=chi2_core,
+        chi2_ring=chi2_ring,
+        explained=1.0 - float(square[core].sum()) / max(raised, 1e-12),
+        valid_fraction=min(1.0, n_core / max(full, 1)),
+        misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
+        significance=float(abs(depth) / np.sqrt(max(spread, 1e-30))),
+        converged=converged,
+    )
+
+
+def _support_count(tip: Float, angles: Float, shape: NeedleShape, sigma: float, ends: bool) -> int:
+    """Pixels that the core of the model would have, were nothing masked or outside the film."""
+    half = int(np.ceil(shape.length_px + shape.half_width_px + 2 * sigma))
+    stop = shape.length_px if ends else shape.length_px - _end_reach(shape, sigma)
+    rows, cols = np.mgrid[-half : half + 1, -half : half + 1]
+    frac = tip - np.rint(tip)
+    inside = np.zeros(rows.shape, bool)
+    for angle in angles:
+        c, s = np.cos(angle), -np.sin(angle)
+        along = (cols - frac[0]) * c + (rows - frac[1]) * s
+        across = -(cols - frac[0]) * s + (rows - frac[1]) * c
+        inside |= (along > 0) & (along < stop) & (np.abs(across) < shape.half_width_px * along / (shape.taper * shape.length_px))
+    return int(inside.sum())
+
+
+def _unfit(tip: Float, angles: Float, shape: NeedleShape) -> NeedleFit:
+    nan = float("nan")
+    return NeedleFit(tip, angles, shape, np.zeros(len(angles)), 0.0, nan, np.full((2, 2), nan), 0, np.inf, np.inf, 0.0, 0.0, np.inf, 0.0, False)

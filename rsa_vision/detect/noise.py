@@ -1,0 +1,194 @@
+"""The noise of a film, from the film: variance as a function of the value, correlation between neighbours, and what is saturated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from rsa_vision.types import Float
+
+TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surface, large enough to hold correlated noise
+MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
+LAGS = 5  # correlation is followed to this distance in pixels
+_LEVELS = 12  # value classes of the variance curve
+_QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
+_WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseModel:
+    """Noise of one film.
+
+    Attributes
+    ----------
+    level, variance : ndarray of shape (k,)
+        Variance of one pixel at these values, interpolated in between.
+    correlation : ndarray of shape (2 LAGS + 1, 2 LAGS + 1)
+        Correlation of pixels at (row, col) offsets -LAGS..LAGS; 1 in the middle.
+    floor, ceiling : float
+        Values at or beyond them are saturated and carry no information.
+    """
+
+    level: Float
+    variance: Float
+    correlation: Float
+    floor: float
+    ceiling: float
+
+    def variance_at(self, values: Float) -> Float:
+        """Return the variance of pixels with these expected values (same shape)."""
+        return np.interp(values, self.level, self.variance)
+
+    @property
+    def typical_sd(self) -> float:
+        """Standard deviation of one pixel at the middle of the film's values."""
+        return float(np.sqrt(np.median(self.variance)))
+
+
+def saturation(film: NDArray[Any], bits: int) -> tuple[float, float]:
+    """Return the values at and beyond which pixels are saturated.
+
+    A limit of the value range counts as saturation only where a crowd of pixels piles up on it: more than on the values beside it.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    bits : int
+        Significant bits.
+
+    Returns
+    -------
+    floor, ceiling : float
+        Pixels must lie strictly between; infinite where nothing is saturated.
+    """
+    sample = film[:: max(1, film.shape[0] // 1500), :: max(1, film.shape[1] // 1500)]
+    low, high = int(sample.min()), int(sample.max())
+    crowd = max(20, sample.size // 20000)
+    full = 2**bits - 1
+    floor, ceiling = -np.inf, np.inf
+    if np.count_nonzero(sample == high) > crowd and (high >= full or _piles_up(sample, high, -1)):
+        ceiling = float(high)
+    if np.count_nonzero(sample == low) > crowd and (low == 0 or _piles_up(sample, low, 1)):
+        floor = float(low)
+    return floor, ceiling
+
+
+def _piles_up(sample: NDArray[Any], edge: int, inward: int) -> bool:
+    neighbours = [np.count_nonzero(sample == edge + inward * k) for k in range(1, 6)]
+    return np.count_nonzero(sample == edge) > 5 * max(1, max(neighbours))
+
+
+def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
+    """Estimate the noise of a film from tiles spread over it.
+
+    In every tile a quadratic surface is removed. Structure only ever adds variance, so within each class of values the quieter tiles are
+    taken; their bias against the mean is undone with the chi-square quantile, for as many degrees of freedom as the correlation leaves.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    bits : int
+
+    Returns
+    -------
+    NoiseModel
+    """
+    floor, ceiling = saturation(film, bits)
+    n_rows, n_cols = film.shape[0] // TILE, film.shape[1] // TILE
+    step = max(1, int(np.ceil(np.sqrt(n_rows * n_cols / MAX_TILES))))
+    tiles = film[: n_rows * TILE, : n_cols * TILE].reshape(n_rows, TILE, n_cols, TILE)[::step, :, ::step].swapaxes(1, 2)
+    tiles = tiles.reshape(-1, TILE, TILE).astype(np.float64)
+    whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
+    tiles = tiles[whole] if whole.any() else tiles
+    axis = np.linspace(-1, 1, TILE)
+    gx, gy = np.meshgrid(axis, axis)
+    basis = np.linalg.qr(np.stack([b.ravel() for b in (np.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy)], axis=1))[0]
+    flat = tiles.reshape(len(tiles), -1)
+    rest = flat - (flat @ basis) @ basis.T
+    dof = TILE * TILE - basis.shape[1]
+    variance = np.einsum("ij,ij->i", rest, rest) / dof
+    mean = flat.mean(1)
+    order = np.argsort(mean)
+    level, curve, quiet = [], [], []
+    for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
+        chosen = part[np.argsort(variance[part])][: max(3, len(part) // 4)]
+        level.append(float(mean[chosen].mean()))
+        curve.append(float(np.median(variance[chosen])))
+        quiet.append(chosen)
+    chosen = np.concatenate(quiet)
+    correlation, hidden = _correlation(rest[chosen], variance[chosen])
+    independent = (TILE * TILE - basis.shape[1]) / max(float((correlation**2).sum()), 1.0)
+    bias = chi2.ppf(0.125, independent) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
+    level_array, curve_array = np.array(level), np.maximum(np.array(curve) / bias, _QUANTISATION)
+    ranked = np.argsort(level_array)
+    return NoiseModel(level_array[ranked], curve_array[ranked], correlation, floor, ceiling)
+
+
+
+def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
+    tiles = (rest / np.sqrt(np.maximum(variance, 1e-12))[:, None]).reshape(-1, TILE, TILE)
+    size = 2 * TILE
+    spectrum = np.abs(np.fft.rfft2(tiles, s=(size, size))) ** 2
+    sums = np.fft.irfft2(spectrum.mean(0), s=(size, size))
+    lag = np.arange(-LAGS, LAGS + 1)
+    pairs = (TILE - np.abs(lag))[:, None] * (TILE - np.abs(lag))[None, :]
+    auto = sums[np.ix_(lag % size, lag % size)] / pairs
+    auto = auto / auto[LAGS, LAGS]
+    return _smooth_correlation(auto)
+
+
+def _smooth_correlation(auto: Float) -> tuple[Float, float]:
+    """Describe measured correlations as white noise plus noise blurred by a Gaussian (screen or detector), less a constant.
+
+    The surface that was removed from a tile takes low frequencies with it, which lowers all correlations by about the same amount and hides
+    some of the variance. The description gives both back.
+    """
+    lag = np.arange(-LAGS, LAGS + 1)
+    square = (lag[:, None] ** 2 + lag[None, :] ** 2).astype(np.float64)
+    others = square > 0
+    best: tuple[float, float, float, float] = (np.inf, 0.0, 0.0, 1.0)
+    for sigma in np.geomspace(0.4, 3.0, 40):
+        shape = np.exp(-square[others] / (4 * sigma**2))  # autocorrelation of noise blurred by sigma
+        (alpha, beta), *_ = np.linalg.lstsq(np.column_stack([shape, -np.ones_like(shape)]), auto[others], rcond=None)
+        misfit = float(((auto[others] - alpha * shape + beta) ** 2).sum())
+        if misfit < best[0]:
+            best = (misfit, float(alpha), float(beta), float(sigma))
+    _, alpha, beta, sigma = best
+    beta = max(beta, 0.0)
+    part = min(alpha / (1 + beta), 1.0)
+    if part < _WHITE:
+        return (square == 0).astype(np.float64), 0.0
+    correlation = part * np.exp(-square / (4 * sigma**2))
+    correlation[LAGS, LAGS] = 1.0
+    return correlation, beta
+
+
+def influence_covariance(influence: Float, correlation: Float) -> Float:
+    """Return the covariance of linear functions of correlated noise.
+
+    A weighted least-squares fit stays unbiased when the noise of neighbouring pixels is correlated, but its variance is no longer the inverse
+    of the normal matrix; this is the "sandwich" for it.
+
+    Parameters
+    ----------
+    influence : ndarray of shape (p, s, s)
+        What one standard deviation of noise in each pixel does to each of ``p`` parameters; 0 outside the fit.
+    correlation : ndarray of shape (2 LAGS + 1, 2 LAGS + 1)
+
+    Returns
+    -------
+    ndarray of shape (p, p)
+    """
+    size = influence.shape[1] + correlation.shape[0]
+    spectrum = np.fft.rfft2(influence, s=(size, size))
+    shift = correlation.shape[0] // 2
+    kernel = np.zeros((size, size))
+    kernel[: correlation.shape[0], : correlation.shape[1]] = correlation
+    power = np.fft.rfft2(np.roll(kernel, (-shift, -shift), (0, 1))).real
+    spread = np.fft.irfft2(spectrum * np.maximum(power, 0.0), s=(size, size))[:, : influence.shape[1], : influence.shape[2]]
+    covariance: Float = np.einsum("prc,qrc->pq", influence, spread)
+    return covariance

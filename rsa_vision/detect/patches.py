@@ -1,0 +1,86 @@
+"""Square windows of a film as one array, with the weights that mask what is not to be fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.types import Bool, Float, Int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    """Windows of equal size around marker candidates.
+
+    Attributes
+    ----------
+    values : ndarray of shape (n, s, s)
+        Film values, float64.
+    valid : ndarray of bool, shape (n, s, s)
+        False outside the film and where the film is saturated.
+    corner_px : ndarray of int, shape (n, 2)
+        (col, row) of the first pixel of each window.
+    """
+
+    values: Float
+    valid: Bool
+    corner_px: Int
+
+    @property
+    def size(self) -> int:
+        """Side of the windows in pixels."""
+        return int(self.values.shape[1])
+
+
+def cut(film: NDArray[Any], centres_px: Float, half: int, noise: NoiseModel) -> Patches:
+    """Cut windows of ``2 half + 1`` pixels around rounded centres.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    centres_px : ndarray of shape (n, 2)
+        (col, row).
+    half : int
+    noise : NoiseModel
+        Says which values are saturated.
+
+    Returns
+    -------
+    Patches
+    """
+    corner = np.rint(centres_px).astype(np.int64) - half
+    step = np.arange(2 * half + 1)
+    cols = corner[:, 0, None] + step
+    rows = corner[:, 1, None] + step
+    inside_c = (cols >= 0) & (cols < film.shape[1])
+    inside_r = (rows >= 0) & (rows < film.shape[0])
+    values = film[np.clip(rows, 0, film.shape[0] - 1)[:, :, None], np.clip(cols, 0, film.shape[1] - 1)[:, None, :]].astype(np.float64)
+    valid = inside_r[:, :, None] & inside_c[:, None, :] & (values > noise.floor) & (values < noise.ceiling)
+    return Patches(values, valid, corner)
+
+
+def weighted_least_squares(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
+    """Return one damped Gauss-Newton step: the weighted least-squares solution with columns scaled to one.
+
+    Parameters
+    ----------
+    jac : ndarray of shape (n, p)
+    weight, target : ndarray of shape (n,)
+    damping : float
+        Relative to the scaled diagonal; keeps what the pixels do not determine where it is.
+
+    Returns
+    -------
+    ndarray of shape (p,)
+    """
+    weighted = jac * weight[:, None]
+    normal = weighted.T @ jac
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+    normal = normal / np.outer(scale, scale)
+    normal[np.diag_indices_from(normal)] += damping
+    solution: Float = np.linalg.solve(normal, weighted.T @ target / scale) / scale
+    return solution
