@@ -21,6 +21,7 @@ from rsa_vision.detect.find import (
     find_tees,
     first_look,
     misfit,
+    plausible,
     settle_tees,
     significance,
     significance_limit,
@@ -77,22 +78,23 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     candidates = find_candidates(values, STRENGTH, noise)
     seeds = first_look(values, candidates, noise)
     found: list[tuple[float, Detection]] = []
-    for sign in _polarities(seeds, candidates):
+    for sign in _polarities(seeds, candidates, noise):
         found.append(_one_polarity(values, bits, sign, seeds, candidates, noise, false_detections))
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
 
-def _polarities(seeds: BallFits, candidates: Candidates) -> list[int]:
+def _polarities(seeds: BallFits, candidates: Candidates, noise: NoiseModel) -> list[int]:
     """Signs of depth worth looking at; both only where neither is clearly the markers'."""
+    clear = plausible(seeds, noise, slack=1.5) & (seeds.valid_fraction > 0.95)
     weight = {
-        sign: float(np.minimum(significance(seeds), 50.0)[np.sign(seeds.depth) == sign].sum())
+        sign: float(np.minimum(significance(seeds), 50.0)[clear & (np.sign(seeds.depth) == sign)].sum())
         + 5.0 * float((np.sign(candidates.junctions[:, 4]) == -sign).sum())
         for sign in (-1, 1)
     }
     best = max(weight, key=lambda sign: weight[sign])
     if weight[best] == 0:
         return []
-    return [best] if weight[-best] < 0.15 * weight[best] else [best, -best]
+    return [best] if weight[-best] < 0.25 * weight[best] else [best, -best]
 
 
 def _one_polarity(
@@ -123,7 +125,8 @@ def _one_polarity(
     keep = strong_enough(balls, limit) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees)
     balls, touching = balls.rows(keep), touching[keep]
     images = _table(film, bits, balls, touching, tees, noise)
-    evidence = float(np.minimum(images.snr, 50.0).sum())
+    trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
+    evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
     return evidence, Detection(images, sign < 0, optics, noise)
 
 

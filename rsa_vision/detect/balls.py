@@ -36,6 +36,10 @@ class BallFits:
         Fraction of the excess variance under the ball, over a background without ball, that the ball explains (1: all).
     valid_fraction : ndarray of shape (n,)
         Part of the pixels under the ball that were neither masked nor outside the film.
+    window_fraction : ndarray of shape (n,)
+        The same for the whole window.
+    log_likelihood : ndarray of shape (n,)
+        Of the whole window, but for a constant: minus half the weighted sum of squared residuals.
     background : ndarray of shape (n,)
         Background value at the centre.
     converged : ndarray of bool, shape (n,)
@@ -49,6 +53,8 @@ class BallFits:
     chi2_ring: Float
     explained: Float
     valid_fraction: Float
+    window_fraction: Float
+    log_likelihood: Float
     background: Float
     converged: Bool
 
@@ -109,7 +115,7 @@ def fit_balls(
     extra : ndarray of shape (n, s, s), optional
         Images of neighbours, in film values, to be subtracted first.
     quick : bool
-        For a first look: half the steps, and covariances as if the noise were white.
+        For a first look: a third of the steps, and covariances as if the noise were white.
 
     Returns
     -------
@@ -145,7 +151,7 @@ def _fit_batch(
     theta = np.zeros((n, 7))
     converged = np.zeros(n, bool)
     model = data
-    for step in range(_STEPS // 2 if quick else _STEPS):
+    for step in range(4 if quick else _STEPS):
         value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px)
         jac[:, :, 3] = value
         if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
@@ -190,6 +196,8 @@ def _fit_batch(
         chi2_ring=chi2_ring,
         explained=1.0 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
+        window_fraction=valid.mean(1),
+        log_likelihood=-0.5 * square.sum(1),
         background=theta[:, 1],
         converged=converged,
     )

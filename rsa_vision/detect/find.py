@@ -36,7 +36,9 @@ class Optics:
     mu_px: float
 
 
-def fit_at(film: NDArray[Any], position_px: Float, radius_px: Float, optics: Optics, noise: NoiseModel, others: Any = None, *, quick: bool = False) -> BallFits:
+def fit_at(
+    film: NDArray[Any], position_px: Float, radius_px: Float, optics: Optics, noise: NoiseModel, others: Any = None, *, quick: bool = False
+) -> BallFits:
     """Fit balls at these places, in windows that suit their radii.
 
     Parameters
@@ -101,7 +103,7 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     -------
     ndarray of bool, shape (n,)
     """
-    usable = (fits.valid_fraction > 0.6) & np.isfinite(fits.position_px).all(1)
+    usable = (fits.valid_fraction > 0.3) & (fits.window_fraction > 0.5) & np.isfinite(fits.position_px).all(1)
     return usable & (misfit(fits, noise) < MISFIT * slack) & (fits.explained > 1 - (1 - EXPLAINED) * slack) & (significance(fits) > 5.0)
 
 
@@ -155,6 +157,8 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> O
     """
     if len(seeds.depth) == 0:
         return Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
+    clear = seeds.rows((seeds.valid_fraction > 0.98) & (seeds.window_fraction > 0.8))
+    seeds = clear if len(clear.depth) else seeds
     best = np.argsort(misfit(seeds, noise) + (1 - seeds.explained))[: 3 * _MOST_SEEDS]
     position, radius = seeds.position_px[best], seeds.radius_px[best]
 
@@ -263,7 +267,9 @@ def settle_tees(film: NDArray[Any], tees: list[NeedleFit], junctions: Float, opt
     for attempt in range(3):
         tees = _round(film, tees, optics, noise, rigid=True)
         tees = [fit for fit in tees if is_tee(fit, slack=ROUGH)]
-        if tees and attempt < 2:
+        if not any(is_tee(fit) for fit in tees):
+            return [], optics  # crossings of other things: not one is a tee even with its neighbours taken away
+        if attempt < 2:
             tees += _second_chance(film, tees, junctions, optics, noise)
     tees = [fit for fit in _round(film, tees, optics, noise) if is_tee(fit, slack=ROUGH)]
     if not tees:
@@ -302,6 +308,8 @@ def _parallel(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: 
 
 def _second_chance(film: NDArray[Any], tees: list[NeedleFit], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     typical = min(tees, key=lambda f: f.misfit)
+    if len(junctions) > 4 * len(tees):
+        return []
     found: list[NeedleFit] = []
     for col, row, *_ in junctions:
         taken = [*tees, *found]
@@ -354,4 +362,4 @@ def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
 
 def _no_fits() -> BallFits:
     none = np.zeros(0)
-    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), none, none, none, none, none, np.zeros(0, bool))
+    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), none, none, none, none, none, none, none, np.zeros(0, bool))

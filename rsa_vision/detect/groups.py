@@ -102,6 +102,8 @@ def fit_group(
         chi2_ring=np.full(k, (square * ring).sum() / max(ring.sum() - 6, 1.0)),
         explained=1 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
+        window_fraction=np.full(k, valid.mean()),
+        log_likelihood=np.full(k, -0.5 * square.sum()),
         background=np.full(k, theta[k]),
         converged=np.full(k, converged),
     )

@@ -16,6 +16,7 @@ from rsa_vision.types import Float
 
 RINGS_PX = (6.0, 9.0, 13.0, 19.0)  # film pixels; a tee shows on the rings that lie within its arms
 DIRECTIONS = 24
+LEAST = 1.5  # score, in units of what counts as significant
 _GAP = 0.5  # between the arms the answer may reach this part of the weakest arm
 
 
@@ -71,7 +72,7 @@ def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Floa
             better = value > best[r, c]
             r, c, k = r[better], c[better], k[better]
             best[r, c], angle[r, c], ring[r, c] = value[better], theta[k], radius
-    peak = (best > 1.0) & (best == cv2.dilate(best, np.ones((9, 9), np.uint8)))
+    peak = (best > LEAST) & (best == cv2.dilate(best, np.ones((9, 9), np.uint8)))
     r, c = np.nonzero(peak)
     return np.stack([(c + 0.5) * size - 0.5, (r + 0.5) * size - 0.5, angle[r, c], ring[r, c], best[r, c]], axis=1).astype(np.float64)
 

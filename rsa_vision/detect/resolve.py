@@ -22,6 +22,7 @@ Background = Callable[[Float, Float], Float]
 
 TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the fit of the other
 _MOST_IN_GROUP = 5
+_LIKE = 0.35  # logarithm of the radius, against the film's median
 
 
 def resolve_balls(
@@ -55,7 +56,8 @@ def resolve_balls(
     tried = _unexplained_pairs(candidates, good, optics)
     for members in tried:
         position, radius = members[:, :2], members[:, 2]
-        fits.append(fit_group(film, position, radius, optics.sigma_px, optics.mu_px, noise, tees))
+        pair = fit_group(film, position, radius, optics.sigma_px, optics.mu_px, noise, tees)
+        fits.append(pair.rows(_like(pair, good)))
     alone = [g[0] for g in groups if len(g) == 1]
     if alone:
         index = np.array(alone)
@@ -76,6 +78,12 @@ def resolve_balls(
     for g, several in zip(_groups(found, optics), near, strict=True):
         touching[g] = several
     return found, touching
+
+
+def _like(fits: BallFits, known: BallFits) -> Bool:
+    """Say which balls of a group are like those of the film that stand alone: two blobs can explain much that is none."""
+    size = np.abs(np.log(fits.radius_px / np.median(known.radius_px))) < _LIKE
+    return np.asarray(size & (np.abs(fits.depth) > 0.4 * np.median(np.abs(known.depth))))
 
 
 def inside(fits: BallFits, film: NDArray[Any]) -> Bool:
