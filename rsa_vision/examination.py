@@ -144,7 +144,7 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
     pairing = _pair(table, bundle, scale, study, region)
     complete = name_objects(named, table, bundle, pairing, foreign)
     reconstruction = reconstruct(complete.points, cage, study.limits)
-    findings += [(code, "") for code in pairing.reasons] + lonely_images(table, pairing, bundle)
+    findings += _pair_findings(pairing, study) + lonely_images(table, pairing, bundle)
     return _judged(complete, reconstruction, findings + judge(reconstruction, _nominal(study, cage), study.limits))
 
 
@@ -166,7 +166,7 @@ def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) 
     pairing = _pair(table, bundle, scale, study, None)
     nothing = table.with_points(table.points.rows(~everything), table.rows[:0])
     complete = name_objects(nothing, table, bundle, pairing, ~everything)
-    findings = [(code, "") for code in pairing.reasons] + lonely_images(table, pairing, bundle)
+    findings = _pair_findings(pairing, study) + lonely_images(table, pairing, bundle)
     if not pairing.groups:
         return _failed(complete, [*findings, ("cage-not-found", "no image of one film meets one of the other: look at the calibration")])
     reconstruction = reconstruct_calibrated(complete.points, cameras, study.limits)
@@ -178,6 +178,11 @@ def _pair(table: Readings, bundle: RayBundle, mm_per_px: Mapping[int, float], st
     return pair_rays(
         bundle, study.limits, region=region, radius_mm=table.radius_px[bundle.image] * scale, contrast=table.contrast[bundle.image]
     )
+
+
+def _pair_findings(pairing: Pairing, study: Study) -> list[Finding]:
+    doubtful = f"{pairing.ambiguous.sum()} of {len(pairing.groups)} markers: the pairing has a posterior below {study.limits.posterior:g}"
+    return [(code, doubtful) for code in pairing.reasons]
 
 
 def _read(film: Film, focus: int | None, pitch_mm: tuple[float, float] | None, study: Study) -> FilmReading:

@@ -19,7 +19,7 @@ from rsa_vision.types import Float
 
 COLOURS: Final = ("#0a9bff", "#ff8000", "#b45cf0", "#4caf50")  # of the foci; the first two are told apart by colour-blind readers too
 MOST_PICTURED: Final = 60  # examinations with pictures; of more, those that are not ok come first
-SYMBOL_SHARE: Final = 1 / 110  # size of a symbol on the longest side of a film
+SYMBOL_SHARE: Final = 1 / 130  # size of a symbol on the longest side of a film
 LABEL_SHARE: Final = 0.06  # of a film's width, for a label
 RUN_KEYS: Final = ("source", "cage", "calibration", "start", "end", "rsa_vision", "host", "system", "python")
 PLOT_PX: Final = (460, 330)
