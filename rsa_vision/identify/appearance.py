@@ -60,6 +60,8 @@ def appearance(scene: Scene, parameters: Float, images: FilmImages) -> Float:
 
 def angle_difference_deg(scene: Scene, parameters: Float, images: FilmImages) -> Float:
     """Angle of every image against the stem that every mark would show, shape (m, n); NaN where either has none or shapes differ."""
+    if not (np.isfinite(scene.stem).any() and np.isfinite(images.angle_rad).any()):
+        return np.full((len(scene.mark), len(images.xy_mm)), np.nan)
     stem = np.nan_to_num(scene.stem)
     step = project(scene, parameters, xyz_mm=scene.xyz_mm + 0.5 * stem) - project(scene, parameters)
     predicted = np.where(np.hypot(*step.T) > 0.1, np.arctan2(step[:, 1], step[:, 0]), np.nan)

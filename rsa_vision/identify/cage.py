@@ -16,7 +16,7 @@ from rsa_vision.cages import Cage
 from rsa_vision.identify.appearance import FilmImages, film_images, on_bodies
 from rsa_vision.identify.checks import are_different, far_penalty, impossible_stretch, what_contradicts, what_is_missing
 from rsa_vision.identify.doubts import doubtful_marks, drop_gross_errors, without
-from rsa_vision.identify.film_model import FILM, Scene, build_scene, plane_from_film
+from rsa_vision.identify.film_model import FILM, Scene, build_scene, plane_from_film, project
 from rsa_vision.identify.hypotheses import find_hypotheses, moved_by_a_mark
 from rsa_vision.identify.naming import Naming, melted_images, name_marks
 from rsa_vision.settings import Limits
@@ -24,6 +24,11 @@ from rsa_vision.types import Bool, Float, Int, MarkerImages
 
 TURN_DEG: Final = {"upright": 46.0, "mirrored": 46.0, "any": 180.0}  # largest angle between film and plane
 COMPLETE: Final = 0.85  # of the marks named: no grid moved by a row or column could do that
+MISSING: Final = 1 / 3  # of the marks of a focus may have no image
+MISREAD: Final = 0.45  # or none of the mark's shape
+SAME_MM: Final = 1.5  # hypotheses that show every mark as near as this come to the same naming
+CLOSE: Final = 80.0  # of the best in log evidence: gross errors of others could not make them win
+LEAST_IMAGES: Final = 6  # four fiducial marks and two control points
 LOG_FALSE: Final = 16.0  # evidence against clutter that is demanded: one false cage in 1e7 films
 LOG_MISLED: Final = 7.0  # evidence by which another orientation or focus than told must be better to say so
 
@@ -112,11 +117,9 @@ def identify_cage(
     limits = limits or Limits()
     told = _Reading(tuple(foci), orientation == "mirrored", TURN_DEG[orientation])
     film = _Film(images, cage, pitch_mm, film_shape, {f: np.asarray(place, float) for f, place in {**cage.foci, **(foci_mm or {})}.items()})
-    shaped = np.isin(images.shape, [*{m.shape for m in cage.mark if set(m.foci) & set(foci)}, ""])
-    everything = np.arange(len(images))
-    result = _read(film, told, np.flatnonzero(shaped), limits)
-    if not result and not shaped.all():  # arms may be hidden: a tee is then taken for something else
-        result = _read(film, told, everything, limits)
+    shapes = {m.shape for m in cage.mark if set(m.foci) & set(foci)}
+    shaped = np.isin(images.shape, [*shapes, ""])
+    result = _read(film, told, np.flatnonzero(shaped), shapes != {"ball"}, limits)
     return _doubt_what_was_told(film, told, result, limits) if result else result
 
 
@@ -169,22 +172,40 @@ class _Film:
         return film_images(images.position_px @ to_mm, covariance, images.shape, angle, images.radius_px * scale, self.area_mm2)
 
 
-def _read(film: _Film, reading: _Reading, subset: Int, limits: Limits) -> CageIdentification:
-    """Identify the cage as told, with grids and foci sought among some of the images."""
+def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Limits) -> CageIdentification:
+    """Identify the cage as told. Grids and foci are sought among the likely images; if much is missing then, among all.
+
+    ``misread``: arms may be hidden, and a mark taken for another shape. More of the likely images may then be missing, and what is found
+    among them may be less than what all would show.
+    """
     scene = build_scene(film.cage, reading.foci, film.foci_mm)
-    seen, log_room = film.seen(reading), film.log_room(reading)
-    among = np.isin(film.usable(), subset)
-    answer = _Answer(film.cage, film.images, film.usable(), scene, film.mm_from_px(reading))
-    if among.sum() < 6:
-        return answer.failed(f"{among.sum()} images only")
-    starts = find_hypotheses(scene, seen.xy_mm[among], reading.turn_deg, limits)
-    namings = [naming for start in starts if (naming := name_marks(scene, start, seen, log_room))]
-    if namings:
-        best = max(namings, key=lambda n: n.log_evidence)
-        if (best.image[scene.own] >= 0).mean() < COMPLETE:
-            moved = moved_by_a_mark(scene, best.fit.parameters)
-            namings += [naming for start in moved if (naming := name_marks(scene, start, seen, log_room))]
-    return _decide(answer, scene, namings, seen, limits, log_room)
+    seen, log_room, usable = film.seen(reading), film.log_room(reading), film.usable()
+    answer = _Answer(film.cage, film.images, usable, scene, film.mm_from_px(reading))
+    namings: list[Naming] = []
+    result = answer.failed("too few images")
+    for among, missing in ((np.isin(usable, likely), MISREAD if misread else MISSING), (np.ones(len(usable), bool), MISSING)):
+        if among.sum() < LEAST_IMAGES:
+            continue
+        _weigh(namings, scene, seen, log_room, find_hypotheses(scene, seen.xy_mm[among], reading.turn_deg, missing, limits))
+        complete = any((naming.image[scene.own] >= 0).mean() > COMPLETE for naming in namings)
+        if namings and not complete:
+            best = max(namings, key=lambda n: n.log_evidence)
+            _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters))
+        if complete or not misread or among.all():
+            result = _decide(answer, scene, namings, seen, limits, log_room)
+        if complete or (result and not misread) or among.all():
+            break
+    return result
+
+
+def _weigh(namings: list[Naming], scene: Scene, seen: FilmImages, log_room: float, starts: list[Float]) -> None:
+    """Name the marks for every hypothesis that is not one of the namings already."""
+    for start in starts:
+        places = project(scene, start)
+        if not any(np.abs(places - project(scene, naming.fit.parameters)).max() < SAME_MM for naming in namings):
+            naming = name_marks(scene, start, seen, log_room)
+            if naming:
+                namings.append(naming)
 
 
 def _doubt_what_was_told(film: _Film, told: _Reading, result: CageIdentification, limits: Limits) -> CageIdentification:
@@ -194,7 +215,7 @@ def _doubt_what_was_told(film: _Film, told: _Reading, result: CageIdentification
     named = np.isin(film.usable(), [*result.assignments[told.foci[0]].values()])
     for other in _other_readings(film.cage, told):
         scene, seen, log_room = build_scene(film.cage, other.foci, film.foci_mm), film.seen(other), film.log_room(other)
-        for start in find_hypotheses(scene, seen.xy_mm[named], other.turn_deg, limits):
+        for start in find_hypotheses(scene, seen.xy_mm[named], other.turn_deg, MISSING, limits):
             naming = name_marks(scene, start, seen, log_room)
             if naming and naming.log_evidence - far_penalty(scene, naming, limits) > result.log_evidence + LOG_MISLED:
                 reasons = tuple(dict.fromkeys(("cage-ambiguous", *result.reasons)))
@@ -216,6 +237,8 @@ def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImag
     possible = [n for n in namings if not impossible_stretch(n)]
     if not possible:
         return answer.failed(impossible_stretch(namings[0]))
+    top = max(n.log_evidence for n in possible)
+    possible = [n for n in possible if n.log_evidence > top - CLOSE]
     # gross errors are left out before hypotheses are compared: a single wrong image must not decide
     limit_mm = limits.fiducial_um / 1000
     cleaned = [drop_gross_errors(scene, n, film, limit_mm, log_room) for n in possible]

@@ -19,7 +19,7 @@ LARGEST: Final = 4  # places that are returned
 MOST_LINES: Final = 400
 
 
-def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm: float) -> list[tuple[Float, int]]:
+def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm: float, missing: float) -> list[tuple[Float, int]]:
     """Find places of a focus.
 
     Parameters
@@ -31,13 +31,15 @@ def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm:
     nominal_mm : ndarray of shape (3,)
     reach_mm : float
         Largest distance from the nominal focus.
+    missing : float
+        Largest fraction of control points without an image.
 
     Returns
     -------
     list of (ndarray of shape (3,), int)
         Places and the number of control points with an image there, best first.
     """
-    least = needed(len(controls_mm), 2)
+    least = needed(len(controls_mm), 2, missing)
     through = np.column_stack([images_mm, np.zeros(len(images_mm))])
     towards = controls_mm[:, None] - through[None]
     distance = np.linalg.norm(np.cross(towards, nominal_mm - through[None]), axis=-1) / np.linalg.norm(towards, axis=-1)

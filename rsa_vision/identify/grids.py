@@ -13,25 +13,24 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rsa_vision.types import Bool, Float, Int
+from rsa_vision.types import Bool, Float
 
 SCALE: Final = (0.94, 1.11)  # film / plane: pitch +-3 %, anisotropy +-1 %, gap up to 40 mm of at least 700 mm
 SHEAR: Final = 0.025  # largest half anisotropy or half shear
 NEAR_MM: Final = 1.2  # an affine map leaves a tilted film's perspective: 2 deg on 200 mm are 0.7 mm
 SAME_MM: Final = 0.8  # maps whose marks all lie closer than this are one
 SHIFT_MM: Final = 0.6  # images of two foci that are closer than this are told apart by the full model only
-MISSING: Final = 1 / 3  # of the marks of a focus may have no image
 LARGEST: Final = 60  # candidate maps looked at closely
 
 
-def needed(count: int, least: int) -> int:
+def needed(count: int, least: int, missing: float) -> int:
     """Return how many of ``count`` marks must be found (at least ``least``)."""
-    return max(least, count - int(count * MISSING + 1e-9))
+    return max(least, count - int(count * missing + 1e-9))
 
 
 @lru_cache(maxsize=64)
-def _triples(marks: tuple[tuple[float, float], ...]) -> tuple[tuple[int, int, int], ...]:
-    """Choose spread triples such that one of them is whole whichever third of the marks is missing (small cages: proven by trying)."""
+def _triples(marks: tuple[tuple[float, float], ...], least: int) -> tuple[tuple[int, int, int], ...]:
+    """Choose spread triples such that one of them is whole whichever ``least`` marks are there (small cages: proven by trying)."""
     points = np.array(marks)
     count = len(points)
     usable = range(count) if count <= 30 else np.linspace(0, count - 1, 30).astype(int).tolist()
@@ -46,7 +45,7 @@ def _triples(marks: tuple[tuple[float, float], ...]) -> tuple[tuple[int, int, in
         if area > 0.05 * longest**2:
             ranked.append((area, (triple[order[0]], triple[order[1]], triple[order[2]])))
     ranked.sort(key=lambda item: -item[0])
-    unhit = {frozenset(s) for s in combinations(range(count), needed(count, 4))} if count <= 12 else set()
+    unhit = {frozenset(s) for s in combinations(range(count), least)} if count <= 12 else set()
     used = np.zeros(count)
     chosen: list[tuple[int, int, int]] = []
     while ranked and (unhit if count <= 12 else len(chosen) < 24):
@@ -86,7 +85,7 @@ class _Raster:
 
 
 def find_grids(
-    images_mm: Float, fiducials_mm: Float, *, turn_deg: float, foci: int, largest_shift_mm: float
+    images_mm: Float, fiducials_mm: Float, *, turn_deg: float, foci: int, largest_shift_mm: float, missing: float
 ) -> list[tuple[Float, Float, int]]:
     """Find all places of a grid of fiducial marks among the images of a film.
 
@@ -102,6 +101,8 @@ def find_grids(
         Exposures on this film: every grid may occur that often, shifted.
     largest_shift_mm : float
         Between two of them.
+    missing : float
+        Largest fraction of the marks without an image.
 
     Returns
     -------
@@ -109,7 +110,7 @@ def find_grids(
         Film from plane (``A @ x + b``) and the number of marks on images, best first.
     """
     n, m = len(images_mm), len(fiducials_mm)
-    least = needed(m, 4)
+    least = needed(m, 4, missing)
     if n < least or n < 4:
         return []
     tree = cKDTree(images_mm)
@@ -136,7 +137,7 @@ def _hypotheses(images: Float, tree: cKDTree, marks: Float, turn_deg: float, lea
     raster = _Raster(images, NEAR_MM)
     homogeneous = np.column_stack([marks, np.ones(len(marks))])
     found: list[tuple[Float, int]] = []
-    for a, b, c in _triples(tuple(map(tuple, marks.tolist()))):
+    for a, b, c in _triples(tuple(map(tuple, marks.tolist())), least):
         side = marks[b] - marks[a]
         base = np.hypot(*side)
         low, high = SCALE[0] * (1 - SHEAR) * base, SCALE[1] * (1 + SHEAR) * base
@@ -213,22 +214,20 @@ def _shifts(affine: Float, images: Float, tree: cKDTree, marks: Float, least: in
     neighbours = [tree.query_ball_point(place, largest + NEAR_MM) for place in places]
     owner = np.repeat(np.arange(len(marks)), [len(some) for some in neighbours])
     shifts = images[np.concatenate([np.array(some, int) for some in neighbours])] - places[owner]
-    close: Int = np.zeros((len(shifts), len(marks)), int)
-    for mark in range(len(marks)):  # one mark may have many images near a shift, and counts once
-        mine = shifts[owner == mark]
-        if len(mine):
-            close[:, mark] = (np.abs(shifts[:, None] - mine[None]).max(axis=2) < NEAR_MM).any(axis=1)
-    votes = close.sum(axis=1)
+    apart = np.abs(shifts[:, None] - shifts[None]).max(axis=2)
+    starts = np.flatnonzero(np.diff(owner, prepend=-1))  # one mark may have many images near a shift, and counts once
+    nearest = np.minimum.reduceat(apart, starts, axis=1) < NEAR_MM
+    votes = nearest.sum(axis=1)
     found: list[tuple[Float, int]] = []
     for index in np.argsort(-votes, kind="stable"):
         if votes[index] < least or len(found) >= 8:
             break
-        # each vote's centre: the median of the nearest residual of every mark
-        nearest = [
-            shifts[owner == mark][np.argmin(np.abs(shifts[owner == mark] - shifts[index]).max(axis=1))]
-            for mark in np.flatnonzero(close[index])
+        if any(np.abs(affine[2] + shifts[index] - other[2]).max() < SHIFT_MM for other, _ in found):
+            continue
+        agreeing = [
+            first + int(np.argmin(apart[index, first:last])) for first, last in zip(starts, [*starts[1:], len(shifts)], strict=True)
         ]
-        shift = np.median(nearest, axis=0)
+        shift = np.median(shifts[[i for i in agreeing if apart[index, i] < NEAR_MM]], axis=0)
         if all(np.abs(affine[2] + shift - other[2]).max() > SHIFT_MM for other, _ in found):
             moved = affine.copy()
             moved[2] += shift

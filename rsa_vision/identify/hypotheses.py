@@ -23,7 +23,7 @@ OVERLAP: Final = 0.5  # of the fiducial marks must lie on others after a move th
 _Place = tuple[Float, Float, Float, Int]  # film from plane (A, b), focus, image of every mark
 
 
-def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, limits: Limits) -> list[Float]:
+def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, missing: float, limits: Limits) -> list[Float]:
     """Return parameters of the film model to start from, the most promising first."""
     reach = FOCUS_REACH * limits.focus_mm
     base = max((float(np.hypot(*(a - b)[:2])) for a in scene.nominal_mm for b in scene.nominal_mm), default=0.0)
@@ -37,12 +37,12 @@ def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, limits: Limits)
         controls = scene.xyz_mm[mine & scene.own & ~scene.fiducial]
         key = fiducials.tobytes()
         if key not in grids:
-            grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=len(scene.foci), largest_shift_mm=shift)
+            grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=len(scene.foci), largest_shift_mm=shift, missing=missing)
         options.append(
             [
                 (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))
                 for A, b, _ in grids[key]
-                for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach)
+                for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach, missing)
             ]
         )
     # an image that two foci claim counts once: otherwise the marks of one focus would do for both

@@ -29,6 +29,7 @@ LEARNT_FROM: Final = 5  # pairs beyond doubt that teach what pairs look like
 SURE: Final = 0.99
 PRIOR: Final = (0.02, 0.95)  # bounds of the learnt fraction of rays that have a partner
 FEATURES: Final = (("size", 0.01, 0.2), ("size ratio", 0.01, 0.2), ("contrast ratio", 0.03, 0.4))  # least sd, sd of unrelated images; logs
+UNKNOWN: Final = 5.0  # unrelated crossings that a guess of their looks weighs like
 MOST_GROUPS: Final = 20_000
 
 Region = Callable[[Float], Bool]
@@ -153,12 +154,15 @@ def pair_rays(
     """
     limits = limits or Limits()
     images = np.unique(bundle.image)
-    edges = _edges(bundle, region or _in_front(bundle), radius_mm, contrast)
+    finite = np.isfinite(bundle.through_mm).all(axis=1)
+    finite &= np.isfinite(bundle.covariance_mm2).all(axis=(1, 2))
+    edges = _edges(bundle, finite, region or _in_front(bundle, finite), radius_mm, contrast)
     if not len(edges.a):
         return Pairing((), np.zeros(0), np.zeros(0, bool), np.zeros(0), (), images, 0.0, ())
     slack = _slack(edges) if slack_mm is None else slack_mm
     edges = edges.with_slack(slack)
-    edges = edges.rows(edges.distance_mm < limits.crossing_sigma * edges.sigma_mm)
+    crossing = edges.distance_mm < limits.crossing_sigma * edges.sigma_mm
+    edges, unrelated = edges.rows(crossing), edges.rows(~crossing)
     foci = len(np.unique(bundle.focus))
     groups, crossings, membership = _groups(bundle, edges, foci)
     look = np.zeros(len(edges.a))
@@ -168,22 +172,24 @@ def pair_rays(
         gain = crossings @ (edges.log_ratio()) + membership @ look + np.log(prior / (1 - prior)) * (np.array([len(g) for g in groups]) - 1)
         packing = pack([tuple(sorted(set(bundle.image[list(g)].tolist()))) for g in groups], gain)
         prior = _fraction(groups, packing, len(images), foci)
-        look = _appearance(edges, membership, packing)
+        look = _appearance(edges, unrelated, membership, packing)
     return _pairing(bundle, edges, groups, membership, packing, images, limits, slack)
 
 
-def _in_front(bundle: RayBundle) -> Region:
-    origins = np.unique(bundle.origin_mm, axis=0)
-    towards = np.array([bundle.direction[(bundle.origin_mm == o).all(axis=1)].mean(axis=0) for o in origins])
+def _in_front(bundle: RayBundle, finite: Bool) -> Region:
+    origins = np.unique(bundle.origin_mm[finite], axis=0)
+    towards = np.array([bundle.direction[finite & (bundle.origin_mm == o).all(axis=1)].mean(axis=0) for o in origins])
 
     def inside(points: Float) -> Bool:
-        result: Bool = np.logical_and.reduce([(points - o) @ d > 0 for o, d in zip(origins, towards, strict=True)])
+        result: Bool = np.logical_and.reduce(
+            [np.ones(points.shape[:-1], bool)] + [(points - o) @ d > 0 for o, d in zip(origins, towards, strict=True)]
+        )
         return result
 
     return inside
 
 
-def _edges(bundle: RayBundle, region: Region, radius_mm: Float | None, contrast: Float | None) -> _Edges:
+def _edges(bundle: RayBundle, finite: Bool, region: Region, radius_mm: Float | None, contrast: Float | None) -> _Edges:
     """List the pairs of rays of different foci and images that cross within the widest window at a possible place."""
     parts: list[_Edges] = []
     n = len(bundle)
@@ -191,8 +197,8 @@ def _edges(bundle: RayBundle, region: Region, radius_mm: Float | None, contrast:
         log_radius = np.log(radius_mm) if radius_mm is not None else np.full(n, np.nan)
         log_contrast = np.log(contrast) if contrast is not None else np.full(n, np.nan)
     length = np.linalg.norm(bundle.through_mm - bundle.origin_mm, axis=1)
-    for p, q in combinations(np.unique(bundle.focus), 2):
-        first, second = np.flatnonzero(bundle.focus == p), np.flatnonzero(bundle.focus == q)
+    for p, q in combinations(np.unique(bundle.focus[finite]), 2):
+        first, second = np.flatnonzero(finite & (bundle.focus == p)), np.flatnonzero(finite & (bundle.focus == q))
         points, distance, sigma = cross(bundle.rows(first), bundle.rows(second))
         with np.errstate(invalid="ignore"):
             possible = np.isfinite(distance) & (sigma > 0) & (bundle.image[first][:, None] != bundle.image[second][None])
@@ -266,15 +272,18 @@ def _fraction(groups: list[tuple[int, ...]], packing: Packing, images: int, foci
     return float(np.clip((paired + 1) / (images + 2), *PRIOR))
 
 
-def _appearance(edges: _Edges, membership: Float, packing: Packing) -> Float:
-    """Return the log likelihood ratio of what each pair looks like, by what the sure pairs look like."""
+def _appearance(edges: _Edges, unrelated: _Edges, membership: Float, packing: Packing) -> Float:
+    """Return the log likelihood ratio of what each pair looks like: by the sure pairs, against crossings that are surely none.
+
+    Images of two markers of one kind may cross by chance, too, and then look like a pair: the unrelated crossings know.
+    """
     sure = (membership[np.nan_to_num(packing.posterior) * packing.chosen > SURE] > 0).any(axis=0)
     total = np.zeros(len(edges.a))
     for column, (_, least, wide) in enumerate(FEATURES):
-        value = edges.features[:, column]
+        value, others = edges.features[:, column], unrelated.features[:, column]
+        others = others[np.isfinite(others)]
         known = np.isfinite(value)
-        # a pair is not judged by what itself has taught
-        for e in np.flatnonzero(known):
+        for e in np.flatnonzero(known):  # a pair is not judged by what itself has taught
             taught = value[sure & known & (edges.a != edges.a[e]) & (edges.b != edges.b[e])]
             n = len(taught)
             if n < LEARNT_FROM:
@@ -282,9 +291,9 @@ def _appearance(edges: _Edges, membership: Float, packing: Packing) -> Float:
             middle = float(np.median(taught))
             spread = max(1.4826 * float(np.median(np.abs(taught - middle))), least) * np.sqrt(1 + 1 / n)
             unlike = (1 + (np.abs(taught - middle) > 4 * spread).sum()) / (n + 2)
-            broad = max(wide, 3 * spread)
-            null = -0.5 * ((value[e] - middle) / broad) ** 2 - np.log(broad * np.sqrt(2 * np.pi))
-            null = max(float(null), -3 - np.log(broad * np.sqrt(2 * np.pi)))
+            broad = _log_student((value[e] - middle) / wide, 3) - np.log(wide)
+            near = np.exp(-0.5 * ((value[e] - others) / spread) ** 2).sum() / (spread * np.sqrt(2 * np.pi))
+            null = float(np.log(near + UNKNOWN * np.exp(broad)) - np.log(len(others) + UNKNOWN))
             alike = _log_student((value[e] - middle) / spread, n - 1) - np.log(spread)
             total[e] += np.logaddexp(np.log1p(-unlike) + alike, np.log(unlike) + null) - null
     return total
