@@ -18,17 +18,16 @@ from rsa_vision.detect.find import (
     STRENGTH,
     Optics,
     estimate_optics,
-    find_tees,
     first_look,
     misfit,
     plausible,
-    settle_tees,
     significance,
     significance_limit,
 )
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.resolve import resolve_balls, strong_enough
+from rsa_vision.detect.tees import find_tees
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
@@ -107,7 +106,7 @@ def _one_polarity(
         candidates.position_px[same], candidates.radius_px[same], candidates.strength[same], candidates.roundness[same], junctions
     )
     optics = estimate_optics(film, seeds, noise)
-    tees, tee_optics = settle_tees(film, find_tees(film, junctions, optics, noise), junctions, optics, noise)
+    tees, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
 
     def tee_images(cols: Float, rows: Float) -> Float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from scipy.stats import norm
 
 from rsa_vision.detect.balls import BallFits, fit_balls, half_size, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles, needle_image, thick_ends
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import cut
 from rsa_vision.types import Bool, Float
@@ -23,9 +22,7 @@ SIGMAS_PX = (0.55, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.6)
 MUS_PX = (0.1, 0.25, 0.5, 1.0, 2.0)
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/detection.md
 EXPLAINED = 0.9
-ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 _MOST_SEEDS = 24
-_LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,13 +174,13 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> O
         return float((area * np.log(np.maximum(fits.chi2_core, 0.05))).sum())
 
     mu = COARSE_MU_PX
-    sigma = _refine(SIGMAS_PX, [cost(t.rows(chosen), s) for s, t in zip(SIGMAS_PX, trials, strict=True)])
-    mu = _refine(MUS_PX, [cost(fit(sigma, m), sigma) for m in MUS_PX])
+    sigma = refine(SIGMAS_PX, [cost(t.rows(chosen), s) for s, t in zip(SIGMAS_PX, trials, strict=True)])
+    mu = refine(MUS_PX, [cost(fit(sigma, m), sigma) for m in MUS_PX])
     near = tuple(sigma * f for f in (0.8, 0.9, 1.0, 1.1, 1.2))
-    return Optics(_refine(near, [cost(fit(s, mu), s) for s in near]), mu)
+    return Optics(refine(near, [cost(fit(s, mu), s) for s in near]), mu)
 
 
-def _refine(grid: tuple[float, ...], costs: list[float]) -> float:
+def refine(grid: tuple[float, ...], costs: list[float]) -> float:
     """Return the minimum on a grid, moved by a parabola through it and its neighbours (in the logarithm)."""
     values = np.array(costs)
     k = int(values.argmin())
@@ -212,152 +209,6 @@ def significance_limit(film_size: int, radius_px: float, false_detections: float
     """
     places = film_size / (np.pi * radius_px**2) * 4  # four filters
     return float(norm.isf(min(0.5, false_detections / places)))
-
-
-def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
-    """Fit a tee at every junction of the right polarity and keep those that the model roughly describes.
-
-    Parameters
-    ----------
-    film : ndarray of shape (rows, cols)
-    junctions : ndarray of shape (n, 5)
-        As of :func:`rsa_vision.detect.junctions.find_junctions`, one polarity.
-    optics : Optics
-    noise : NoiseModel
-
-    Returns
-    -------
-    list of NeedleFit
-        Best first; no two nearer than half an arm. Neighbours whose arms overlap still disturb each other: see :func:`settle_tees`.
-    """
-    fits = []
-    for col, row, angle, ring, _ in junctions:
-        start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring)
-        angles = angle + np.array([0.0, np.pi / 2, -np.pi / 2])
-        fit = fit_needles(film, np.array([col, row]), angles, start, optics.sigma_px, optics.mu_px, noise, rigid=True)
-        if is_tee(fit, slack=ROUGH):
-            fits.append(fit)
-    fits.sort(key=lambda f: f.misfit + 1 - f.explained)
-    kept: list[NeedleFit] = []
-    for fit in fits:
-        if all(np.hypot(*(fit.position_px - k.position_px)) > 0.4 * k.shape.length_px for k in kept):
-            kept.append(fit)
-    return kept
-
-
-def settle_tees(film: NDArray[Any], tees: list[NeedleFit], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], Optics]:
-    """Fit tees whose arms overlap together (each with the others' images subtracted, until nothing moves), then drop what is none.
-
-    Parameters
-    ----------
-    film : ndarray of shape (rows, cols)
-    tees : list of NeedleFit
-    junctions : ndarray of shape (n, 5)
-        Those not yet taken get a second chance once the tees beside them are known.
-    optics : Optics
-    noise : NoiseModel
-
-    Returns
-    -------
-    list of NeedleFit, Optics
-        The optics with the attenuation that suits the arms: they are thinner than balls, and the film curve is bent.
-    """
-    if not tees:
-        return [], optics
-    for attempt in range(3):
-        tees = _round(film, tees, optics, noise, rigid=True)
-        tees = [fit for fit in tees if is_tee(fit, slack=ROUGH)]
-        if not any(is_tee(fit) for fit in tees):
-            return [], optics  # crossings of other things: not one is a tee even with its neighbours taken away
-        if attempt < 2:
-            tees += _second_chance(film, tees, junctions, optics, noise)
-    tees = [fit for fit in _round(film, tees, optics, noise) if is_tee(fit, slack=ROUGH)]
-    if not tees:
-        return [], optics
-    sample = sorted(tees, key=lambda f: f.misfit)[:8]
-
-    def cost(mu: float) -> float:
-        trial = Optics(optics.sigma_px, mu)
-        return float(sum(np.log(max(_with_neighbours(film, f, tees, trial, noise, ends=False).chi2_core, 0.05)) for f in sample))
-
-    mus = tuple(optics.mu_px * f for f in (0.25, 0.5, 0.75, 1.0, 1.35, 2.0, 4.0))
-    optics = Optics(optics.sigma_px, _refine(mus, [cost(mu) for mu in mus]))
-    tees = _round(film, _round(film, tees, optics, noise), optics, noise)
-    tees = [fit for fit in (_with_neighbours(film, fit, tees, optics, noise, ends=False) for fit in tees) if is_tee(fit)]
-    return _parallel(film, tees, optics, noise), optics
-
-
-def _parallel(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
-    """Let the arms of all tees be parallel, if the film agrees: arms that are parallel on a cage stay so on a film, nearly.
-
-    The tip is where lines along the arms meet, so what is known of their directions sharpens it. Films on which the arms are not parallel
-    (the likelihood tells) keep a direction for each.
-    """
-    if len(tees) < _LEAST_PARALLEL:
-        return tees
-    spread = np.array([np.angle(np.exp(1j * (f.angles - f.angles[0]))) for f in tees])
-    common = np.median(spread, axis=0)
-    turn = np.median([np.angle(np.exp(1j * (f.angles - common - tees[0].angles[0]))).mean() for f in tees]) + tees[0].angles[0]
-    tied = [
-        _with_neighbours(film, replace(fit, angles=turn + common), tees, optics, noise, ends=False, rigid=True) for fit in tees
-    ]
-    worse = sum(t.n_core * (t.chi2_core - f.chi2_core) / max(f.chi2_core, 1.0) for t, f in zip(tied, tees, strict=True))
-    freedom = 2 * len(tees) * noise.correlation.sum()  # two directions less for each, in noise that is correlated
-    return tied if worse < 2.0 * freedom and all(is_tee(t) for t in tied) else tees
-
-
-def _second_chance(film: NDArray[Any], tees: list[NeedleFit], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
-    typical = min(tees, key=lambda f: f.misfit)
-    if len(junctions) > 4 * len(tees):
-        return []
-    found: list[NeedleFit] = []
-    for col, row, *_ in junctions:
-        taken = [*tees, *found]
-        if min(np.hypot(t.position_px[0] - col, t.position_px[1] - row) for t in taken) < 0.4 * typical.shape.length_px:
-            continue
-        start = replace(typical, position_px=np.array([col, row]))
-        fit = _with_neighbours(film, start, taken, optics, noise, ends=True, rigid=True)
-        apart = min(np.hypot(*(t.position_px - fit.position_px)) for t in taken) > 0.4 * typical.shape.length_px
-        if apart and is_tee(fit, slack=ROUGH):
-            found.append(fit)
-    return found
-
-
-def _round(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel, *, rigid: bool = False) -> list[NeedleFit]:
-    """Fit every tee again, each with the newest images of the others subtracted."""
-    tees = list(tees)
-    for i, fit in enumerate(tees):
-        tees[i] = _with_neighbours(film, fit, tees, optics, noise, ends=True, rigid=rigid)
-    return tees
-
-
-def _with_neighbours(film: NDArray[Any], fit: NeedleFit, tees: list[NeedleFit], optics: Optics, noise: NoiseModel, *, ends: bool, rigid: bool = False) -> NeedleFit:
-    reach = 2.4 * fit.shape.length_px + 8
-    gaps = [float(np.hypot(*(t.position_px - fit.position_px))) for t in tees]
-    near = [t for t, gap in zip(tees, gaps, strict=True) if 0.2 * fit.shape.length_px < gap < reach]  # nearer: itself
-
-    def others(cols: Float, rows: Float) -> tuple[Float, Bool]:
-        total, doubtful = np.zeros_like(cols), np.zeros(cols.shape, bool)
-        for t in near:
-            dx, dy = cols - t.position_px[0], rows - t.position_px[1]
-            total += needle_image(dx, dy, t, optics.sigma_px, optics.mu_px)
-            if not ends:
-                doubtful |= thick_ends(dx, dy, t.angles, t.shape, optics.sigma_px)
-        return total, doubtful
-
-    return fit_needles(
-        film, fit.position_px, fit.angles, fit.shape, optics.sigma_px, optics.mu_px, noise, others=others if near else None, ends=ends, rigid=rigid
-    )
-
-
-def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
-    """Say whether a fit looks like a tee: little misfit, arms square to each other, all of it on the film."""
-    if not np.isfinite(fit.misfit) or fit.significance < 6.0 or fit.valid_fraction < 0.6:
-        return False
-    turn = np.angle(np.exp(1j * (fit.angles - fit.angles[0])))
-    square = abs(turn[1] - np.pi / 2) < 0.35 and abs(turn[2] + np.pi / 2) < 0.35
-    slim = fit.shape.length_px > 2.0 * fit.shape.half_width_px
-    return square and slim and fit.misfit < 1.3 * MISFIT * slack and fit.explained > 1 - (1 - EXPLAINED) * slack
 
 
 def _no_fits() -> BallFits:

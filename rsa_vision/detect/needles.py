@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.detect.balls import polynomial
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
@@ -20,10 +20,11 @@ from rsa_vision.detect.patches import cut, weighted_least_squares
 from rsa_vision.types import Bool, Float
 
 CELL = 0.3  # pixels between the nodes of a needle table
-GRID_W, GRID_L = 0.125, 0.5  # pixels between the shapes that have tables of their own
+GRID_W, GRID_L = 0.25, 1.0  # pixels between the shapes that have tables of their own
 _PAD = 6.0  # blur widths around the needle that a table covers
 _STEPS = 14
 _CONVERGED_PX = 5e-4
+_CLOSE_PX = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,24 +86,52 @@ class NeedleFit:
     converged: bool
 
 
-@lru_cache(maxsize=1024)
-def _table(half_width: float, length: float, taper: float, sigma: float, mu: float) -> tuple[Float, float, float]:
+@lru_cache(maxsize=512)
+def _opacity(half_width: float, length: float, taper: float, sigma: float, mu: float) -> tuple[Float, float, float]:
     pad = _PAD * sigma
     s = np.arange(-pad, length + pad + CELL, CELL)
-    p = np.arange(0.0, half_width + pad + CELL, CELL)
-    p = np.concatenate([-p[:0:-1], p])
+    p = np.arange(0.0, half_width + pad + CELL, CELL)  # one half; the other is its mirror image
     fine_s = (s[:, None] + CELL * (np.arange(2) - 0.5) / 2).ravel()
     fine_p = (p[:, None] + CELL * (np.arange(2) - 0.5) / 2).ravel()
     width = half_width * np.clip(fine_s / (taper * length), 0.0, 1.0)
     width[fine_s > length] = 0.0
-    chord = 2 * np.sqrt(np.maximum(width[:, None] ** 2 - fine_p[None, :] ** 2, 0.0))
-    opacity = (-np.expm1(-mu * chord)).reshape(len(s), 2, len(p), 2).mean((1, 3))
-    return gaussian_filter(opacity, sigma / CELL, mode="constant", truncate=5.0), float(s[0]), float(p[0])
+    square = np.maximum(width[:, None] ** 2 - fine_p[None, :] ** 2, 0.0)
+    opacity = (-np.expm1(-2 * mu * np.sqrt(square))).reshape(len(s), 2, len(p), 2).mean((1, 3))
+    along = gaussian_filter1d(opacity, sigma / CELL, axis=0, mode="constant", truncate=4.5)
+    half = gaussian_filter1d(along, sigma / CELL, axis=1, mode="mirror", truncate=4.5)
+    return np.concatenate([half[:, :0:-1], half], axis=1), float(s[0]), -float(p[-1])
 
 
-def _look_up(table: tuple[Float, float, float], s: Float, p: Float) -> Float:
-    values, s0, p0 = table
-    return map_coordinates(values, [(s - s0) / CELL, (p - p0) / CELL], order=1, mode="constant")
+@lru_cache(maxsize=128)
+def _table(half_width: float, length: float, taper: float, sigma: float, mu: float) -> tuple[Float, tuple[int, int], float, float]:
+    """Opacity, its slopes along and across the needle, and by half width and length: the last axis, so that one look-up finds all five."""
+    base, s0, p0 = _opacity(half_width, length, taper, sigma, mu)
+    wide, *_, p1 = _opacity(round(half_width + GRID_W, 4), length, taper, sigma, mu)
+    long, *_ = _opacity(half_width, round(length + GRID_L, 4), taper, sigma, mu)
+    side = round((p0 - p1) / CELL)
+    by_width = (wide[: base.shape[0], side : side + base.shape[1]] - base) / GRID_W
+    by_length = (long[: base.shape[0]] - base) / GRID_L
+    columns = np.stack([base, np.gradient(base, CELL, axis=0), np.gradient(base, CELL, axis=1), by_width, by_length], axis=-1)
+    return columns.reshape(-1, 5), base.shape, s0, p0
+
+
+def _look_up(table: tuple[Float, tuple[int, int], float, float], s: Float, p: Float) -> Float:
+    """Interpolate all columns of a table bilinearly; 0 beyond it."""
+    columns, (n_s, n_p), s0, p0 = table
+    at_s, at_p = (s - s0) / CELL, (p - p0) / CELL
+    out = np.zeros((5, len(s)))
+    inside = np.nonzero((at_s >= 0) & (at_s < n_s - 1) & (at_p >= 0) & (at_p < n_p - 1))[0]
+    at_s, at_p = at_s[inside], at_p[inside]
+    low_s, low_p = at_s.astype(np.intp), at_p.astype(np.intp)
+    part_s, part_p = (at_s - low_s)[:, None], (at_p - low_p)[:, None]
+    first = low_s * n_p + low_p
+    near = columns[first]
+    near += part_p * (columns[first + 1] - near)
+    far = columns[first + n_p]
+    far += part_p * (columns[first + n_p + 1] - far)
+    near += part_s * (far - near)
+    out[:, inside] = near.T
+    return out
 
 
 def needle_image(dx: Float, dy: Float, fit: NeedleFit, sigma_px: float, mu_px: float) -> Float:
@@ -119,32 +148,25 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, sigma_px: float, mu_px: f
     -------
     ndarray of the shape of ``dx``
     """
-    values = _jacobian(dx, dy, fit.angles, fit.shape, sigma_px, mu_px)[0]
-    image: Float = np.tensordot(fit.depths, values, axes=1)
+    values = arm_images(dx.ravel(), dy.ravel(), fit.angles, fit.shape, sigma_px, mu_px)[0]
+    image: Float = (fit.depths @ values).reshape(dx.shape)
     return image
 
 
-def _jacobian(
+def arm_images(
     dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float, mu: float
 ) -> Float:
     """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the first axis."""
     # tables stand on a grid of shapes, shared by all needles of a film; in between the image is linear in the shape
     off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % GRID_L
-    w, l = round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4)
-    rest = (shape.taper, round(sigma, 3), round(mu, 4))
-    base, wide, long = _table(w, l, *rest), _table(round(w + GRID_W, 4), l, *rest), _table(w, round(l + GRID_L, 4), *rest)
-    slope = (np.gradient(base[0], CELL, axis=0), np.gradient(base[0], CELL, axis=1))
+    table = _table(round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4), shape.taper, round(sigma, 3), round(mu, 4))
     arms = []
     for angle in angles:
         c, s = np.cos(angle), -np.sin(angle)
-        along, across = dx * c + dy * s, -dx * s + dy * c
-        one = _look_up(base, along, across)
-        g_s = _look_up((slope[0], *base[1:]), along, across)
-        g_p = _look_up((slope[1], *base[1:]), along, across)
-        more_w = (_look_up(wide, along, across) - one) / GRID_W
-        more_l = (_look_up(long, along, across) - one) / GRID_L
-        d_angle = g_s * -across + g_p * along  # counter-clockwise as displayed, the row axis pointing down
-        arms.append((one + off_w * more_w + off_l * more_l, g_p * s - g_s * c, -g_s * s - g_p * c, more_w, more_l, d_angle))
+        along, across = dx * c + dy * s, dy * c - dx * s
+        base, g_s, g_p, more_w, more_l = _look_up(table, along, across)
+        d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
+        arms.append((base + off_w * more_w + off_l * more_l, g_p * s - g_s * c, -g_s * s - g_p * c, more_w, more_l, d_angle))
     return np.array(arms).swapaxes(0, 1)
 
 
@@ -159,7 +181,7 @@ def thick_ends(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: f
     return inside
 
 
-def _beyond(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float) -> Bool:
+def beyond_ends(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float) -> Bool:
     """Return the pixels of the thick ends and of what lies behind them."""
     out = np.zeros(dx.shape, bool)
     for angle in angles:
@@ -172,7 +194,7 @@ def _end_reach(shape: NeedleShape, sigma: float) -> float:
     return 0.5 * shape.half_width_px + 2.2 * sigma
 
 
-def _support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:
+def support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:
     """Pixels within ``margin`` of an arm's axis rectangle."""
     inside = np.hypot(dx, dy) < margin
     for angle in angles:
@@ -194,6 +216,7 @@ def fit_needles(
     others: Any = None,
     ends: bool = True,
     rigid: bool = False,
+    quick: bool = False,
 ) -> NeedleFit:
     """Fit one pin (one angle) or tee (three).
 
@@ -217,6 +240,8 @@ def fit_needles(
     rigid : bool
         The arms turn together; else each has its own direction. With ``ends`` they are equally deep, too: for a first look, while neighbours
         still disturb.
+    quick : bool
+        While others still move: fewer steps, and a covariance as if the noise were white.
 
     Returns
     -------
@@ -227,9 +252,9 @@ def fit_needles(
     corner = patch.corner_px[0]
     rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
     cols, rows = cols + float(corner[0]), rows + float(corner[1])
-    keep = patch.valid[0] & _support(cols - tip_px[0], rows - tip_px[1], angles, shape, 3 * sigma_px + 4.0)
+    keep = patch.valid[0] & support(cols - tip_px[0], rows - tip_px[1], angles, shape, 3 * sigma_px + (1.0 if quick else 4.0))
     if not ends:
-        keep &= ~_beyond(cols - tip_px[0], rows - tip_px[1], angles, shape, sigma_px)
+        keep &= ~beyond_ends(cols - tip_px[0], rows - tip_px[1], angles, shape, sigma_px)
     cols, rows, raw = cols[keep], rows[keep], patch.values[0][keep]
     neighbours = np.zeros_like(raw)
     if others is not None:
@@ -248,17 +273,18 @@ def fit_needles(
     n_shape = 2 if ends else 1
     n_turn = 1 if rigid else k
     n_free = 2 + n_shape + n_turn
-    for step in range(_STEPS + 1):
-        value, d_col, d_row, d_w, d_l, d_angle = _jacobian(cols - tip[0], rows - tip[1], angles, shape, sigma_px, mu_px)
+    steps, close = (6, _CLOSE_PX) if quick else (_STEPS, _CONVERGED_PX)
+    for step in range(steps + 1):
+        value, d_col, d_row, d_w, d_l, d_angle = arm_images(cols - tip[0], rows - tip[1], angles, shape, sigma_px, mu_px)
         linear = np.column_stack([*(value.sum(0, keepdims=True) if n_depth < k else value), surface])
-        if step == 0 or step == _STEPS or converged:
+        if step == 0 or step == steps or converged:
             theta = weighted_least_squares(linear, weight, data)
         depths = np.broadcast_to(theta[:n_depth], (k,)).copy()
         residual = data - linear @ theta
         common = [depths @ d for d in (d_col, d_row, d_w, d_l)[: 2 + n_shape]]
         turns = depths[:, None] * d_angle
         jac = np.column_stack([*common, *(turns.sum(0, keepdims=True) if rigid else turns), linear])
-        if step == _STEPS or converged:
+        if step == steps or converged:
             break
         if step in (1, 4):
             weight = 1.0 / noise.variance_at(linear @ theta + neighbours)
@@ -270,7 +296,7 @@ def fit_needles(
         shape = NeedleShape(width, float(np.clip(shape.length_px + longer, 3.0, half / 1.05)), shape.taper)
         angles += scale * delta[n_free - n_turn : n_free]
         theta = theta + scale * delta[n_free:]
-        converged = step > 1 and bool(np.abs(delta[:2]).max() < _CONVERGED_PX)
+        converged = step > 0 and bool(np.abs(delta[:2]).max() < close)
         if np.hypot(*(tip - tip_px)) > 0.6 * half:
             return _unfit(tip, angles, shape)
     weighted = jac * weight[:, None]
@@ -289,7 +315,7 @@ def fit_needles(
     background = float(theta[n_depth])
     variance = float(noise.variance_at(np.array([background]))[0])
     spread = covariance[n_free : n_free + n_depth, n_free : n_free + n_depth].mean()  # variance of the mean depth
-    full = _support_count(tip, angles, shape, sigma_px, ends)
+    full = core_pixels(tip, angles, shape, sigma_px, ends)
     return NeedleFit(
         position_px=tip,
         angles=angles,
@@ -297,7 +323,7 @@ def fit_needles(
         depths=depths,
         depth=depth,
         background=background,
-        covariance_px2=influence_covariance(influence, noise.correlation),
+        covariance_px2=covariance[:2, :2] if quick else influence_covariance(influence, noise.correlation),
         n_core=n_core,
         chi2_core=chi2_core,
         chi2_ring=chi2_ring,
@@ -309,7 +335,7 @@ def fit_needles(
     )
 
 
-def _support_count(tip: Float, angles: Float, shape: NeedleShape, sigma: float, ends: bool) -> int:
+def core_pixels(tip: Float, angles: Float, shape: NeedleShape, sigma: float, ends: bool) -> int:
     """Pixels that the core of the model would have, were nothing masked or outside the film."""
     half = int(np.ceil(shape.length_px + shape.half_width_px + 2 * sigma))
     stop = shape.length_px if ends else shape.length_px - _end_reach(shape, sigma)

@@ -19,7 +19,7 @@ from rsa_vision.types import Float
 REACH = 6.0  # blur widths beyond the rim at which the image has faded (exp(-18))
 _Y_MIN, _Y_MAX = 0.4, 22.0  # r / sigma covered by the tables
 _X_STEP, _Y_STEP = 0.04, 0.02  # of rho / sigma, and of log(r / sigma), in the fine tables
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,7 @@ class BallTable:
         return out[0], out[1], out[2]
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=64)
 def ball_table(mu_sigma: float) -> BallTable:
     """Build the table for one attenuation.
 

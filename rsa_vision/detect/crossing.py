@@ -1,0 +1,141 @@
+"""Tees whose arms cross or lie on each other: one fit for all of them on one background, so that their errors stay honest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls import polynomial
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, beyond_ends, core_pixels, support
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.types import Float
+
+_STEPS = 16
+_CONVERGED_PX = 1e-3
+
+
+def fit_crossing(
+    film: NDArray[Any],
+    needles: Sequence[NeedleFit],
+    sigma_px: float,
+    mu_px: float,
+    noise: NoiseModel,
+    *,
+    others: Any = None,
+    ends: bool = True,
+    steps: int = _STEPS,
+) -> list[NeedleFit]:
+    """Fit several pins or tees at once; the arms of each turn together.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    needles : sequence of NeedleFit
+        Starts.
+    sigma_px, mu_px : float
+    noise : NoiseModel
+    others : callable, optional
+        As of :func:`rsa_vision.detect.needles.fit_needles`.
+    ends : bool
+        As there: True has the thick ends take part, each needle's length free and one depth for its arms; False leaves the ends out, holds
+        lengths and gives every arm its own depth.
+    steps : int
+        At the most.
+
+    Returns
+    -------
+    list of NeedleFit
+        In the order of the starts; figures of merit are taken under each needle's own arms.
+    """
+    now = list(needles)
+    middle = np.mean([f.position_px for f in now], axis=0)
+    spread = max(float(np.abs(f.position_px - middle).max()) for f in now)
+    half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in now) + 3 * sigma_px + 3))
+    patch = cut(film, middle[None], half, noise)
+    corner = patch.corner_px[0].astype(np.float64)
+    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
+    cols, rows = cols + corner[0], rows + corner[1]
+    near = np.zeros(cols.shape, bool)
+    keep = patch.valid[0].copy()
+    for f in now:
+        dx, dy = cols - f.position_px[0], rows - f.position_px[1]
+        near |= support(dx, dy, f.angles, f.shape, 3 * sigma_px + 4.0)
+        if not ends:
+            keep &= ~beyond_ends(dx, dy, f.angles, f.shape, sigma_px)
+    keep &= near
+    cols, rows, raw = cols[keep], rows[keep], patch.values[0][keep]
+    neighbours = np.zeros_like(raw)
+    if others is not None:
+        neighbours, doubtful = others(cols, rows)
+        cols, rows, raw, neighbours = (array[~doubtful] for array in (cols, rows, raw, neighbours))
+    data = raw - neighbours
+    surface = polynomial(half, cols - middle[0], rows - middle[1])
+    weight = 1.0 / noise.variance_at(raw)
+    n_shape = 2 if ends else 1
+    each = 2 + n_shape + 1
+    converged = False
+    for step in range(steps + 1):
+        blocks = [arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, sigma_px, mu_px) for f in now]
+        images = [b[0].sum(0, keepdims=True) if ends else b[0] for b in blocks]
+        counts = [len(i) for i in images]
+        linear = np.column_stack([*np.concatenate(images), surface])
+        theta = weighted_least_squares(linear, weight, data, 1e-6)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        now = [
+            replace(f, depths=np.broadcast_to(theta[a:b], f.angles.shape).copy()) for f, a, b in zip(now, starts, starts[1:], strict=False)
+        ]
+        moves = []
+        for f, (_, d_col, d_row, d_w, d_l, d_angle) in zip(now, blocks, strict=True):
+            moves += [f.depths @ d for d in (d_col, d_row, d_w, d_l)[: 2 + n_shape]] + [f.depths @ d_angle]
+        jac = np.column_stack([*moves, linear])
+        residual = data - linear @ theta
+        if step == steps or converged:
+            break
+        if step in (2, 6):
+            weight = 1.0 / noise.variance_at(linear @ theta + neighbours)
+        delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 4 else 1e-6)[: each * len(now)].reshape(-1, each)
+        scale = min(1.0, 1.0 / max(float(np.abs(delta[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(delta[:, -1]).max()), 1e-9))
+        now = [_moved(f, scale * d, half, ends) for f, d in zip(now, delta, strict=True)]
+        converged = step > 1 and float(np.abs(delta[:, :2]).max()) < _CONVERGED_PX
+    covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
+    influence = np.zeros((len(jac.T), patch.size, patch.size))
+    influence[:, (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)] = covariance @ (jac * np.sqrt(weight)[:, None]).T
+    out = []
+    square = weight * residual**2
+    depth_at = each * len(now)
+    for i, (f, block) in enumerate(zip(now, blocks, strict=True)):
+        image = f.depths @ block[0]
+        depth = float(f.depths.mean())
+        core = np.abs(image) > 0.08 * max(float(np.abs(image).max()), 1e-9)
+        chi2_core = float(square[core].mean()) if core.any() else np.inf
+        raised = float((weight * (residual + image) ** 2)[core].sum())
+        index = slice(depth_at + starts[i], depth_at + starts[i + 1])
+        variance = float(noise.variance_at(np.array([theta[-6]]))[0])
+        out.append(
+            replace(
+                f,
+                depth=depth,
+                background=float(theta[-6]),
+                covariance_px2=influence_covariance(influence[each * i : each * i + 2], noise.correlation),
+                n_core=int(core.sum()),
+                valid_fraction=min(1.0, int(core.sum()) / max(core_pixels(f.position_px, f.angles, f.shape, sigma_px, ends), 1)),
+                chi2_core=chi2_core,
+                explained=1.0 - float(square[core].sum()) / max(raised, 1e-12),
+                misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
+                significance=float(abs(depth) / np.sqrt(max(covariance[index, index].mean(), 1e-30))),
+                converged=converged,
+            )
+        )
+    return out
+
+
+def _moved(fit: NeedleFit, delta: Float, half: int, ends: bool) -> NeedleFit:
+    width = float(np.clip(fit.shape.half_width_px + np.clip(delta[2], -0.5, 0.5), 0.6, 0.3 * fit.shape.length_px))
+    longer = float(np.clip(delta[3], -2.0, 2.0)) if ends else 0.0
+    shape = NeedleShape(width, float(np.clip(fit.shape.length_px + longer, 3.0, half / 1.05)), fit.shape.taper)
+    return replace(fit, position_px=fit.position_px + delta[:2], shape=shape, angles=fit.angles + delta[-1])

@@ -1,0 +1,219 @@
+"""The tees of a film: a few from junctions, the others from their likeness, all fitted with the neighbours whose arms they cross."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from rsa_vision.detect.crossing import fit_crossing
+from rsa_vision.detect.find import EXPLAINED, MISFIT, Optics, refine
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles, needle_image, thick_ends
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.templates import find_like
+from rsa_vision.types import Bool, Float
+
+ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
+ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
+_MOST_JUNCTIONS = 80
+_MOST_TOGETHER = 4  # tees in one fit; larger sets are cut where they overlap least
+_NEAREST_PX = 3.0  # two tips nearer than this are one
+_LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
+_ATTENUATIONS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.2)  # of the arms, relative to the balls
+
+
+def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], Optics]:
+    """Find and fit all tees of one polarity.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    junctions : ndarray of shape (n, 5)
+        As of :func:`rsa_vision.detect.junctions.find_junctions`, one polarity.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    list of NeedleFit, Optics
+        The optics with the attenuation that suits the arms: they are thinner than balls, and the film curve is bent.
+    """
+    models = _models(film, junctions, optics, noise)
+    if not models:
+        return [], optics
+    tees = _like(film, models, optics, noise)
+    for _ in range(2):
+        tees = _distinct(_fit_all(film, tees, optics, noise, ends=True), models[0])
+    if not tees:
+        return [], optics
+    optics = _attenuation(film, tees, optics, noise)
+    tees = _fit_all(film, tees, optics, noise, ends=True)
+    offsets, error = _common_directions(film, tees, optics, noise)
+    if offsets is not None:
+        tees = [replace(t, angles=_mean_turn(t.angles, offsets) + offsets) for t in tees]
+    # with the directions held, the slanted thick ends can no longer turn the arms: they may lend their weight
+    tees = _fit_all(film, tees, optics, noise, ends=offsets is not None)
+    return [_with_error(t, error) for t in tees if is_tee(t)], optics
+
+
+def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
+    """Say whether a fit looks like a tee: little misfit, arms square to each other, all of it on the film."""
+    if not np.isfinite(fit.misfit) or fit.significance < 6.0 or fit.valid_fraction < 0.6:
+        return False
+    turn = np.angle(np.exp(1j * (fit.angles - fit.angles[0])))
+    square = abs(turn[1] - np.pi / 2) < 0.35 and abs(turn[2] + np.pi / 2) < 0.35
+    slim = fit.shape.length_px > 2.0 * fit.shape.half_width_px
+    return bool(square and slim and fit.misfit < 1.3 * MISFIT * slack and fit.explained > 1 - (1 - EXPLAINED) * slack)
+
+
+def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Fit tees at the strongest junctions until a few are clean; the cleanest first, one of each size."""
+    rough: list[NeedleFit] = []
+    for col, row, angle, ring, _ in junctions[np.argsort(-np.abs(junctions[:, 4]))][:_MOST_JUNCTIONS]:
+        start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring)
+        angles = angle + np.array([0.0, np.pi / 2, -np.pi / 2])
+        fit = fit_needles(film, np.array([col, row]), angles, start, optics.sigma_px, optics.mu_px, noise, rigid=True)
+        if is_tee(fit, slack=ROUGH):
+            rough.append(fit)
+        if sum(is_tee(f) for f in rough) >= ENOUGH:
+            break
+    rough.sort(key=lambda f: f.misfit + 1 - f.explained)
+    if not rough or not is_tee(rough[0], slack=1.5):
+        return []  # crossings of other things: not one is nearly a tee
+    clean = [f for f in rough if is_tee(f)] or rough[:1]
+    sizes = sorted(clean, key=lambda f: f.shape.length_px)
+    ends = [sizes[0], sizes[-1]] if sizes[-1].shape.length_px > 1.08 * sizes[0].shape.length_px else []
+    return [clean[0], *(f for f in ends if f is not clean[0])]
+
+
+def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Starts at every place that looks like one of the models."""
+    starts: list[NeedleFit] = []
+    places = [(likeness, col, row, m) for m in models for col, row, likeness in find_like(film, m, optics.sigma_px, optics.mu_px)]
+    for _, col, row, model in sorted(places, key=lambda p: -p[0]):
+        at = np.array([col, row])
+        if all(np.hypot(*(s.position_px - at)) > _NEAREST_PX for s in starts):
+            starts.append(replace(model, position_px=at))
+    return _peeled(film, starts, optics, noise)
+
+
+def _peeled(film: NDArray[Any], starts: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Keep the starts that still have something to explain once better ones have taken their part."""
+    kept: list[NeedleFit] = []
+    for start in starts:  # best likeness first
+        fit = fit_crossing(film, [start], optics.sigma_px, optics.mu_px, noise, others=_others(start, kept, optics, ends=True), steps=3)[0]
+        deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > 0.3 * abs(start.depth)
+        near = np.hypot(*(fit.position_px - start.position_px)) < 2 * _NEAREST_PX
+        if deep and near and is_tee(fit, slack=ROUGH) and all(np.hypot(*(k.position_px - fit.position_px)) > _NEAREST_PX for k in kept):
+            kept.append(fit)
+    return kept
+
+
+def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
+    kept: list[NeedleFit] = []
+    for fit in sorted(tees, key=lambda f: f.misfit + 1 - f.explained):
+        deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > 0.25 * abs(model.depth)
+        if deep and is_tee(fit, slack=ROUGH) and all(np.hypot(*(fit.position_px - k.position_px)) > _NEAREST_PX for k in kept):
+            kept.append(fit)
+    return kept
+
+
+def _fit_all(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel, *, ends: bool) -> list[NeedleFit]:
+    """Fit every set of tees whose arms cross in one go, with the images of the other tees subtracted."""
+    out: list[NeedleFit] = []
+    for members in _clusters(tees):
+        rest = [t for t in tees if all(t is not m for m in members)]
+        others = _others(members, rest, optics, ends=ends)
+        out += fit_crossing(film, members, optics.sigma_px, optics.mu_px, noise, others=others, ends=ends)
+    return out
+
+
+def _clusters(tees: list[NeedleFit]) -> list[list[NeedleFit]]:
+    position = np.array([t.position_px for t in tees])
+    gap = np.hypot(*(position[:, None] - position[None]).transpose(2, 0, 1))
+    length = np.array([t.shape.length_px for t in tees])
+    reach = (length[:, None] + length[None]) * 1.02
+    while True:  # arms that only just touch can do with subtraction, if joining them all would make too large a fit
+        n, label = connected_components(csr_array(gap < reach), directed=False)
+        if n == len(tees) or np.bincount(label).max() <= _MOST_TOGETHER:
+            return [[tees[i] for i in np.nonzero(label == k)[0]] for k in range(n)]
+        reach = reach * 0.85
+
+
+def _others(members: NeedleFit | list[NeedleFit], rest: list[NeedleFit], optics: Optics, *, ends: bool) -> Any:
+    """Images of the tees beside these, for the fits to subtract; None where there are none."""
+    mine = members if isinstance(members, list) else [members]
+    near = []
+    for t in rest:
+        gaps = [np.hypot(*(t.position_px - m.position_px)) - 1.3 * (t.shape.length_px + m.shape.length_px) for m in mine]
+        if min(gaps) < 10:
+            near.append(t)
+    if not near:
+        return None
+
+    def images(cols: Float, rows: Float) -> tuple[Float, Bool]:
+        total, doubtful = np.zeros_like(cols), np.zeros(cols.shape, bool)
+        for t in near:
+            dx, dy = cols - t.position_px[0], rows - t.position_px[1]
+            total += needle_image(dx, dy, t, optics.sigma_px, optics.mu_px)
+            if not ends:
+                doubtful |= thick_ends(dx, dy, t.angles, t.shape, optics.sigma_px)
+        return total, doubtful
+
+    return images
+
+
+def _attenuation(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel) -> Optics:
+    """Estimate the attenuation along the arms from the cleanest tees, by maximum likelihood."""
+    alone = [c[0] for c in _clusters(tees) if len(c) == 1] or tees
+    sample = sorted(alone, key=lambda f: f.misfit)[:6]
+
+    def cost(mu: float) -> float:
+        trial = Optics(optics.sigma_px, mu)
+        fits = [
+            fit_crossing(
+                film, [t], trial.sigma_px, mu, noise, others=_others(t, [o for o in tees if o is not t], trial, ends=False), ends=False
+            )
+            for t in sample
+        ]
+        return float(sum(np.log(max(f[0].chi2_core, 0.05)) for f in fits))
+
+    mus = tuple(optics.mu_px * f for f in _ATTENUATIONS)
+    return Optics(optics.sigma_px, refine(mus, [cost(mu) for mu in mus]))
+
+
+def _common_directions(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel) -> tuple[Float | None, Float]:
+    """Return the directions of the arms relative to the first, if the film's tees share them, and their standard errors.
+
+    Arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along the arms meet, so what is known of their
+    directions sharpens it. Directions are taken from tees that stand alone, each arm free.
+    """
+    alone = [c[0] for c in _clusters(tees) if len(c) == 1]
+    sample = sorted(alone if len(alone) >= _LEAST_PARALLEL else tees, key=lambda f: f.misfit)[:16]
+    if len(sample) < _LEAST_PARALLEL:
+        return None, np.zeros(3)
+    free = []
+    for t in sample:
+        others = _others(t, [o for o in tees if o is not t], optics, ends=False)
+        fit = fit_needles(film, t.position_px, t.angles, t.shape, optics.sigma_px, optics.mu_px, noise, others=others, ends=False)
+        if is_tee(fit, slack=1.5):
+            free.append(np.angle(np.exp(1j * (fit.angles - fit.angles[0]))))
+    if len(free) < _LEAST_PARALLEL:
+        return None, np.zeros(3)
+    spread = 1.4826 * np.median(np.abs(free - np.median(free, axis=0)), axis=0)
+    return np.median(free, axis=0), 1.25 * spread / np.sqrt(len(free))
+
+
+def _mean_turn(angles: Float, offsets: Float) -> float:
+    turn: float = np.angle(np.exp(1j * (angles - offsets)).mean())
+    return turn
+
+
+def _with_error(fit: NeedleFit, direction_error: Float) -> NeedleFit:
+    """Add what errors of the common directions do to the tip: they act at about half an arm's length."""
+    variance = (0.5 * fit.shape.length_px) ** 2 * float((direction_error**2).mean())
+    return replace(fit, covariance_px2=fit.covariance_px2 + variance * np.eye(2))

@@ -1,0 +1,48 @@
+"""More tees like those already known: a matched filter with their own image.
+
+Where the images of two tees from the two foci nearly coincide, rings around the tips no longer look like a T. But other tees of the film
+show what one looks like, and the correlation with that image has a peak of its own for each tip.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.needles import NeedleFit, needle_image
+from rsa_vision.types import Float
+
+LIKENESS = 0.4  # correlation coefficient from which a place is worth a fit; two tees one over the other reach 0.5 to 0.7
+SCALE = 2  # the film is searched at half resolution
+
+
+def find_like(film: NDArray[Any], known: NeedleFit, sigma_px: float, mu_px: float) -> Float:
+    """Find places that look like a known tee.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    known : NeedleFit
+    sigma_px, mu_px : float
+        Blur and attenuation of the film.
+
+    Returns
+    -------
+    ndarray of shape (n, 3)
+        col_px, row_px, correlation coefficient; best first.
+    """
+    half = int(np.ceil(known.shape.length_px + 2 * sigma_px + 2) // SCALE * SCALE)
+    small = cv2.resize(film, (film.shape[1] // SCALE, film.shape[0] // SCALE), interpolation=cv2.INTER_AREA).astype(np.float32)
+    axis = SCALE * (np.arange(-half // SCALE, half // SCALE + 1, dtype=np.float64))
+    template = needle_image(*np.meshgrid(axis, axis), known, float(np.hypot(sigma_px, SCALE / np.sqrt(12))), mu_px).astype(np.float32)
+    if min(small.shape) <= template.shape[0]:
+        return np.zeros((0, 3))
+    likeness = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED)
+    peak = (likeness > LIKENESS) & (likeness == cv2.dilate(likeness, np.ones((5, 5), np.uint8)))
+    row, col = np.nonzero(peak)
+    centre = half // SCALE
+    table = np.stack([(col + centre + 0.5) * SCALE - 0.5, (row + centre + 0.5) * SCALE - 0.5, likeness[row, col]], axis=1)
+    return table[np.argsort(-table[:, 2])].astype(np.float64)
