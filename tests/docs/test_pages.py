@@ -1,0 +1,113 @@
+"""The pages hold every error, reason, flag and column that the program knows, with the right codes, and no other."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+from rsa_vision import errors
+from rsa_vision.cage_drawing import draw_cage
+from rsa_vision.cages import builtin_cages, load_cage, symmetries
+from rsa_vision.flags import REASONS, MarkerFlag, flag_names
+from rsa_vision.settings import Limits, Study
+from rsa_vision.tables import DETECTIONS, SCHEMAS
+from rsa_vision.verdict import FAILURES
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PROSE = sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md"), *(ROOT / "examples").glob("*.*")])
+
+
+def page(name: str) -> str:
+    return (DOCS / name).read_text(encoding="utf-8")
+
+
+def section(name: str, heading: str) -> str:
+    """Return the text under a heading, up to the next one of its level."""
+    text = page(name)
+    start = text.index(f"\n## {heading}\n") + 1
+    end = text.find("\n## ", start)
+    return text[start:] if end < 0 else text[start:end]
+
+
+def rows(text: str) -> list[list[str]]:
+    """Return the cells of the tables in a text, without their heads."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    cells = [[cell.strip() for cell in line.replace(r"\|", "/").strip("|").split("|")] for line in lines]
+    heads = {index - 1 for index, row in enumerate(cells) if set(row[0]) <= set("-:")}
+    return [row for index, row in enumerate(cells) if index not in heads and index - 1 not in heads]
+
+
+def codes(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def test_every_error_with_its_code_and_exit_code() -> None:
+    known = {
+        name: (kind.code, str(kind.exit_code))
+        for name, kind in inspect.getmembers(errors, inspect.isclass)
+        if issubclass(kind, errors.RsaError)
+    }
+    listed = {codes(row[0])[0]: (codes(row[1])[0], row[2]) for row in rows(section("errors.md", "Errors"))}
+    assert listed == known
+    assert all(row[3] and row[4] for row in rows(section("errors.md", "Errors")))
+
+
+def test_every_reason_with_its_status() -> None:
+    listed = {codes(row[0])[0]: row[1] for row in rows(section("errors.md", "Reasons"))}
+    assert listed == {code: "failed" if code in FAILURES else "review" for code in REASONS}
+    assert all(row[2] and row[3] for row in rows(section("errors.md", "Reasons")))
+
+
+def test_every_flag_with_its_name() -> None:
+    listed = {codes(row[0])[0]: codes(row[1])[0] for row in rows(section("errors.md", "Flags"))}
+    assert listed == {flag_names(flag): flag.name for flag in MarkerFlag if flag}
+
+
+@pytest.mark.parametrize("table", SCHEMAS)
+def test_every_column_of_the_tables(table: str) -> None:
+    listed = [name for row in rows(section("files.md", f"{table}.csv")) for name in codes(row[0])]
+    assert sorted(listed) == sorted(SCHEMAS[table])
+
+
+def test_every_column_of_detect() -> None:
+    first = section("files.md", "The table of detect").split(", with the", 1)[0]
+    assert codes(first) == list(DETECTIONS)
+
+
+def test_every_setting() -> None:
+    text = page("quickstart.md")
+    for name in (*Study.model_fields, *Limits.model_fields):
+        assert re.search(rf"^{name} =|`{name}`|\[{name}\]", text, re.MULTILINE), name
+    for name, field in Limits.model_fields.items():
+        if given := re.search(rf"^{name} = (\S+)", text, re.MULTILINE):
+            assert float(given[1]) == field.default, name
+
+
+@pytest.mark.parametrize("name", builtin_cages())
+def test_cage_drawings_and_ambiguities(name: str) -> None:
+    cage = load_cage(name)
+    drawing = DOCS / "images" / f"cage-{name}.svg"
+    assert drawing.read_text(encoding="utf-8") == draw_cage(cage), f"draw it again: rsa-vision cage show {name} -o {drawing}"
+    listed = [row[1] for row in rows(section("cages.md", "What the marks cannot tell")) if codes(row[0]) == [name]]
+    assert listed == [str(symmetry) for symmetry in symmetries(cage)]
+
+
+def test_links_between_files_lead_somewhere() -> None:
+    for path in PROSE:
+        if path.suffix == ".md":
+            for target in re.findall(r"\]\((?!https?:|#)([^)#\s]+)", path.read_text(encoding="utf-8")):
+                assert (path.parent / target).exists(), f"{path.name}: {target}"
+
+
+def test_pictures_are_small() -> None:
+    for picture in (DOCS / "images").iterdir():
+        assert picture.stat().st_size < 300_000, picture.name
+
+
+def test_no_path_of_a_machine() -> None:
+    for path in [*PROSE, *(DOCS / "images").glob("*.svg")]:
+        assert not re.search(r"(?<![\w.])/(tmp|work|home|root|usr)/", path.read_text(encoding="utf-8")), path.name
