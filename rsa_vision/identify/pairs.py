@@ -154,8 +154,8 @@ def pair_rays(
     """
     limits = limits or Limits()
     images = np.unique(bundle.image)
-    finite = np.isfinite(bundle.through_mm).all(axis=1)
-    finite &= np.isfinite(bundle.covariance_mm2).all(axis=(1, 2))
+    known = np.isfinite(bundle.through_mm).all(axis=1) & np.isfinite(bundle.covariance_mm2).all(axis=(1, 2))
+    finite: Bool = np.array(known, dtype=np.bool_)
     edges = _edges(bundle, finite, region or _in_front(bundle, finite), radius_mm, contrast)
     if not len(edges.a):
         return Pairing((), np.zeros(0), np.zeros(0, bool), np.zeros(0), (), images, 0.0, ())

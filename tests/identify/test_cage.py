@@ -46,9 +46,9 @@ def test_random_examinations_have_no_silent_error(name: str, capsys: pytest.Capt
         exposure = random_exposure(rng, cage)
         for foci in films_of(cage):
             film = expose(cage, foci, exposure, rng)
-            start = time.perf_counter()
+            start = time.process_time()
             result = identify(film, cage, foci)
-            seconds.append(time.perf_counter() - start)
+            seconds.append(time.process_time() - start)
             decisive = bool(result) and "cage-ambiguous" not in result.reasons
             counts["films"] += 1
             counts["told"] += not decisive
