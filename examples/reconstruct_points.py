@@ -17,7 +17,6 @@ from rsa_vision.points import read_points
 from rsa_vision.settings import Limits
 from rsa_vision.xray import check_controls, reconstruct
 
-
 SYNTHETIC = Path(__file__).with_name("points_1A.csv")
 
 
