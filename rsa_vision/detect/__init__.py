@@ -17,7 +17,6 @@ from rsa_vision.detect.find import (
     MISFIT,
     STRENGTH,
     Optics,
-    estimate_optics,
     first_look,
     misfit,
     plausible,
@@ -26,12 +25,15 @@ from rsa_vision.detect.find import (
 )
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
+from rsa_vision.detect.optics import estimate_optics
 from rsa_vision.detect.resolve import resolve_balls, strong_enough
 from rsa_vision.detect.tees import find_tees
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
 __all__ = ["Detection", "detect_markers"]
+
+CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,28 +78,35 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     noise = estimate_noise(values, bits)
     candidates = find_candidates(values, STRENGTH, noise)
     seeds = first_look(values, candidates, noise)
-    found: list[tuple[float, Detection]] = []
-    for sign in _polarities(seeds, candidates, noise):
-        found.append(_one_polarity(values, bits, sign, seeds, candidates, noise, false_detections))
+    found = [
+        _one_polarity(values, bits, sign, optics, seeds, candidates, noise, false_detections)
+        for sign, optics in _polarities(values, seeds, candidates, noise)
+    ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
 
-def _polarities(seeds: BallFits, candidates: Candidates, noise: NoiseModel) -> list[int]:
-    """Signs of depth worth looking at; both only where neither is clearly the markers'."""
-    clear = plausible(seeds, noise, slack=1.5) & (seeds.valid_fraction > 0.95)
-    weight = {
-        sign: float(np.minimum(significance(seeds), 50.0)[clear & (np.sign(seeds.depth) == sign)].sum())
-        + 5.0 * float((np.sign(candidates.junctions[:, 4]) == -sign).sum())
-        for sign in (-1, 1)
-    }
+def _polarities(film: NDArray[Any], seeds: BallFits, candidates: Candidates, noise: NoiseModel) -> list[tuple[int, Optics]]:
+    """Signs of depth worth looking at, with their optics; both only where neither is clearly the markers'."""
+    weight, optics = {}, {}
+    for sign in (-1, 1):
+        optics[sign], balls = estimate_optics(film, seeds.rows(np.sign(seeds.depth) == sign), noise)
+        strength = -sign * candidates.junctions[:, 4]
+        weight[sign] = balls + float(np.clip(strength - CLEAR_JUNCTION, 0.0, 20.0).sum())
     best = max(weight, key=lambda sign: weight[sign])
-    if weight[best] == 0:
+    if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():
         return []
-    return [best] if weight[-best] < 0.25 * weight[best] else [best, -best]
+    return [(sign, optics[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
 
 
 def _one_polarity(
-    film: NDArray[Any], bits: int, sign: int, seeds: BallFits, candidates: Candidates, noise: NoiseModel, false_detections: float
+    film: NDArray[Any],
+    bits: int,
+    sign: int,
+    optics: Optics,
+    seeds: BallFits,
+    candidates: Candidates,
+    noise: NoiseModel,
+    false_detections: float,
 ) -> tuple[float, Detection]:
     seeds = seeds.rows(np.sign(seeds.depth) == sign)
     junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
@@ -105,7 +114,6 @@ def _one_polarity(
     mine = Candidates(
         candidates.position_px[same], candidates.radius_px[same], candidates.strength[same], candidates.roundness[same], junctions
     )
-    optics = estimate_optics(film, seeds, noise)
     tees, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
 

@@ -14,6 +14,7 @@ from rsa_vision.types import Bool, Float
 
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; the range is 2.5 to 12
 _STEPS = 12
+COARSE_HALF_PX = 13
 _CONVERGED_PX = 2e-4
 _MAX_STEP_PX = 0.7
 
@@ -139,14 +140,19 @@ def _fit_batch(
     data = patches.values if extra is None else patches.values - extra
     data = data.reshape(n, -1)
     valid = patches.valid.reshape(n, -1).astype(np.float64)
-    axis = np.arange(size, dtype=np.float64)
+    # a first look at a large window does not need every pixel
+    stride = 2 if quick and half > COARSE_HALF_PX else 1
+    axis = np.arange(half % stride, size, stride, dtype=np.float64)
     grid_c, grid_r = (g.ravel() for g in np.meshgrid(axis, axis))
+    looked_at = (grid_r * size + grid_c).astype(np.intp)
+    data, valid = data[:, looked_at], valid[:, looked_at]
+    added = None if extra is None else extra.reshape(n, -1)[:, looked_at]
     surface = polynomial(half, grid_c - half, grid_r - half)
     local = start_px - patches.corner_px
     low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px, half - sigma_px)
     radius = np.clip(start_radius_px, low, high)
     weight = valid / noise.variance_at(patches.values.reshape(n, -1).mean(1))[:, None]
-    jac = np.empty((n, size * size, 10))
+    jac = np.empty((n, len(grid_c), 10))
     jac[:, :, 4:] = surface
     theta = np.zeros((n, 7))
     converged = np.zeros(n, bool)
@@ -158,9 +164,9 @@ def _fit_batch(
             theta = _solve(jac[:, :, 3:], weight, data)
         depth = theta[:, :1]
         jac[:, :, 0], jac[:, :, 1], jac[:, :, 2] = -depth * dx, -depth * dy, depth * slope_r
-        model = np.einsum("npk,nk->np", jac[:, :, 3:], theta)
+        model = np.matmul(jac[:, :, 3:], theta[:, :, None])[:, :, 0]
         if step in (2, 5):  # the variance follows the expected value once the model is near
-            weight = valid / noise.variance_at(model if extra is None else model + extra.reshape(n, -1))
+            weight = valid / noise.variance_at(model if added is None else model + added)
         delta = _solve(jac, weight, data - model, damping=1e-6)
         scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(delta[:, :3]).max(1), 1e-12))[:, None]
         local = np.clip(local + scale * delta[:, :2], 1.0, size - 2.0)
@@ -214,7 +220,7 @@ def _ball(table: BallTable, grid_c: Float, grid_r: Float, local: Float, radius: 
 def _solve(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
     weighted = jac * weight[:, :, None]
     normal = np.matmul(weighted.transpose(0, 2, 1), jac)
-    right = np.einsum("npk,np->nk", weighted, target)
+    right = np.matmul(weighted.transpose(0, 2, 1), target[:, :, None])[:, :, 0]
     scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
     normal = normal / (scale[:, :, None] * scale[:, None, :])
     normal[:, np.arange(jac.shape[2]), np.arange(jac.shape[2])] += damping

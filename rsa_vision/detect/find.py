@@ -18,11 +18,8 @@ from rsa_vision.types import Bool, Float
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
-SIGMAS_PX = (0.55, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.6)
-MUS_PX = (0.1, 0.25, 0.5, 1.0, 2.0)
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/detection.md
 EXPLAINED = 0.9
-_MOST_SEEDS = 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,47 +134,6 @@ def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:
         if not (gap < 0.5 * fits.radius_px[i]).any():
             keep.append(int(i))
     return fits.rows(np.array(keep, dtype=np.intp))
-
-
-def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> Optics:
-    """Estimate blur and attenuation that the best candidates of a film have in common, by maximum likelihood on a grid.
-
-    Parameters
-    ----------
-    film : ndarray of shape (rows, cols)
-    seeds : BallFits
-    noise : NoiseModel
-
-    Returns
-    -------
-    Optics
-    """
-    if len(seeds.depth) == 0:
-        return Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
-    clear = seeds.rows((seeds.valid_fraction > 0.98) & (seeds.window_fraction > 0.8))
-    seeds = clear if len(clear.depth) else seeds
-    best = np.argsort(misfit(seeds, noise) + (1 - seeds.explained))[: 3 * _MOST_SEEDS]
-    position, radius = seeds.position_px[best], seeds.radius_px[best]
-
-    def fit(sigma: float, mu: float) -> BallFits:
-        return fit_at(film, position, radius, Optics(sigma, mu), noise, quick=True)
-
-    # whatever fits badly at every blur is no ball and has no say
-    trials = [fit(sigma, COARSE_MU_PX) for sigma in SIGMAS_PX]
-    closest = np.min([misfit(t, noise) + (1 - t.explained) for t in trials], axis=0)
-    chosen = np.argsort(closest)[:_MOST_SEEDS]
-    chosen = chosen[closest[chosen] < max(0.08, 1.5 * closest[chosen[0]])]
-    position, radius = position[chosen], radius[chosen]
-
-    def cost(fits: BallFits, sigma: float) -> float:
-        area = np.pi * (fits.radius_px + sigma) ** 2
-        return float((area * np.log(np.maximum(fits.chi2_core, 0.05))).sum())
-
-    mu = COARSE_MU_PX
-    sigma = refine(SIGMAS_PX, [cost(t.rows(chosen), s) for s, t in zip(SIGMAS_PX, trials, strict=True)])
-    mu = refine(MUS_PX, [cost(fit(sigma, m), sigma) for m in MUS_PX])
-    near = tuple(sigma * f for f in (0.8, 0.9, 1.0, 1.1, 1.2))
-    return Optics(refine(near, [cost(fit(s, mu), s) for s in near]), mu)
 
 
 def refine(grid: tuple[float, ...], costs: list[float]) -> float:
