@@ -157,7 +157,7 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
     core_n = np.pi * (balls.radius_px + 1) ** 2
     # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
-    excess = np.where(balls.chi2_core > 1 + 3 * np.sqrt(2 / core_n), balls.chi2_core, 1.0)
+    excess = np.where(balls.chi2_uneven > 1 + 3 * np.sqrt(2 / core_n), balls.chi2_uneven, 1.0)
     covariance = np.concatenate(
         [balls.covariance[:, :2, :2] * excess[:, None, None], np.array([t.covariance_px2 * _excess(t) for t in tees]).reshape(-1, 2, 2)]
     )

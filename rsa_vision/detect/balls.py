@@ -33,6 +33,9 @@ class BallFits:
         Of col, row, radius and depth, for the film's noise with its correlation between pixels.
     chi2_core, chi2_ring : ndarray of shape (n,)
         Mean squared residual in units of the noise variance, under the ball (to one blur beyond the rim) and around it.
+    chi2_uneven : ndarray of shape (n,)
+        As ``chi2_core``, of the odd part of the residuals only: errors that are the same on opposite sides of the centre (film curve, focal
+        spot, attenuation) do not move it.
     explained : ndarray of shape (n,)
         Fraction of the excess variance under the ball, over a background without ball, that the ball explains (1: all).
     valid_fraction : ndarray of shape (n,)
@@ -52,6 +55,7 @@ class BallFits:
     covariance: Float
     chi2_core: Float
     chi2_ring: Float
+    chi2_uneven: Float
     explained: Float
     valid_fraction: Float
     window_fraction: Float
@@ -200,6 +204,7 @@ def _fit_batch(
         covariance=covariance[:, :, :4],
         chi2_core=chi2_core,
         chi2_ring=chi2_ring,
+        chi2_uneven=chi2_core if quick else uneven(residual, weight, local, size, core),
         explained=1.0 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
         window_fraction=valid.mean(1),
@@ -207,6 +212,29 @@ def _fit_batch(
         background=theta[:, 1],
         converged=converged,
     )
+
+
+def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) -> Float:
+    """Return the mean square of the odd part of the residuals under balls, in units of the noise; shape (n,).
+
+    Parameters
+    ----------
+    residual, weight : ndarray of shape (n, size * size)
+        Residuals of square windows, 1 / variance (0 where masked).
+    local : ndarray of shape (n, 2)
+        Centres in the windows, (col, row).
+    size : int
+    core : ndarray of bool, shape (n, size * size)
+        Pixels under the ball.
+    """
+    twice = np.rint(2 * local).astype(np.intp)
+    axis = np.arange(size)
+    cols, rows = np.clip(twice[:, :1] - axis, 0, size - 1), np.clip(twice[:, 1:] - axis, 0, size - 1)
+    opposite = (rows[:, :, None] * size + cols[:, None, :]).reshape(len(local), -1)
+    pairs = core & (weight > 0) & (np.take_along_axis(weight, opposite, 1) > 0)
+    odd = residual - np.take_along_axis(residual, opposite, 1)
+    out: Float = (0.5 * pairs * weight * odd**2).sum(1) / np.maximum(pairs.sum(1) - 4, 1.0)
+    return out
 
 
 def _ball(table: BallTable, grid_c: Float, grid_r: Float, local: Float, radius: Float, sigma_px: float) -> tuple[Float, Float, Float, Float]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from rsa_vision.detect.balls import BallFits, fit_balls, half_size, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
@@ -164,9 +164,9 @@ def significance_limit(film_size: int, radius_px: float, false_detections: float
     float
     """
     places = film_size / (np.pi * radius_px**2) * 4  # four filters
-    return float(norm.isf(min(0.5, false_detections / places)))
+    return float(-ndtri(min(0.5, false_detections / places)))
 
 
 def _no_fits() -> BallFits:
     none = np.zeros(0)
-    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), none, none, none, none, none, none, none, np.zeros(0, bool))
+    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), none, none, none, none, none, none, none, none, np.zeros(0, bool))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, polynomial
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, polynomial, uneven
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut, weighted_least_squares
 from rsa_vision.detect.profiles import ball_table
@@ -100,6 +100,7 @@ def fit_group(
         covariance=np.stack([whole[np.ix_(index, index)] for index in own]),
         chi2_core=(square * core).sum(1) / inside,
         chi2_ring=np.full(k, (square * ring).sum() / max(ring.sum() - 6, 1.0)),
+        chi2_uneven=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight, distance.shape), local, patch.size, core),
         explained=1 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
         window_fraction=np.full(k, valid.mean()),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rsa_vision.types import Float
 
@@ -122,7 +122,7 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     chosen = np.concatenate(quiet)
     correlation, hidden = _correlation(rest[chosen], variance[chosen])
     independent = (TILE * TILE - basis.shape[1]) / max(float((correlation**2).sum()), 1.0)
-    bias = chi2.ppf(0.125, independent) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
+    bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     level_array, curve_array = np.array(level), np.maximum(np.array(curve) / bias, _QUANTISATION)
     ranked = np.argsort(level_array)
     return NoiseModel(level_array[ranked], curve_array[ranked], correlation, floor, ceiling)
