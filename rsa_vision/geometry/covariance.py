@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from rsa_vision.geometry.homography import homography_jacobians, parameter_gain
 from rsa_vision.geometry.rays import intersection_jacobians
@@ -36,7 +36,7 @@ def birge_factor(residuals: Float, covariance: Float) -> float:
     if not (expected > 0 and spread > 0):
         return 1.0
     ratio, freedom = float(residuals @ residuals) / expected, expected**2 / spread
-    return float(np.sqrt(ratio)) if ratio > 1 and chi2.sf(ratio * freedom, freedom) < SIGNIFICANCE else 1.0
+    return float(np.sqrt(ratio)) if ratio > 1 and chdtrc(freedom, ratio * freedom) < SIGNIFICANCE else 1.0
 
 
 def blocks(parts: Float) -> Float:
