@@ -46,7 +46,7 @@ def draw(tex: str) -> str:
     body = re.sub(r'width="[\d.]+pt"', size, body, count=1)
     body = re.sub(r'(<svg[^>]*?) height="[\d.]+pt"', r"\1", body, count=1)
     style = f'role="img" aria-label="{escape(tex)}" style="vertical-align: {-depth_px / PT_PER_EM:.3f}em"'
-    return body.replace("<svg ", f"<svg {style} ", 1)
+    return body.strip().replace("<svg ", f"<svg {style} ", 1)
 
 
 def visit_inline(writer: Any, node: nodes.math) -> None:

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from rsa_vision import errors
+from rsa_vision import errors, readings, verdict
 from rsa_vision.cage_drawing import draw_cage
 from rsa_vision.cages import builtin_cages, load_cage, symmetries
 from rsa_vision.flags import REASONS, MarkerFlag, flag_names
+from rsa_vision.geometry.covariance import SIGNIFICANCE
+from rsa_vision.identify import film_model
 from rsa_vision.settings import Limits, Study
 from rsa_vision.tables import DETECTIONS, SCHEMAS
 from rsa_vision.verdict import FAILURES
@@ -85,6 +87,18 @@ def test_every_setting() -> None:
     for name, field in Limits.model_fields.items():
         if given := re.search(rf"^{name} = (\S+)", text, re.MULTILINE):
             assert float(given[1]) == field.default, name
+
+
+def test_numbers_of_the_method_are_those_of_the_code() -> None:
+    text = page("method.md")
+    known = {name: value for module in (verdict, readings, film_model) for name, value in vars(module).items() if name.isupper()}
+    stated = re.findall(r"`([A-Z_]+)` = ([\d.]+)", text)
+    stated += [(codes(row[0])[0], row[1]) for row in rows(section("method.md", "Names of the cage's marks"))]
+    assert len(stated) >= 10
+    assert {name: float(value) for name, value in stated} == {name: known[name] for name, _ in stated}
+    limits = Limits()
+    assert f"{limits.fiducial_um:g} µm in the plane, {limits.line_mm:g} mm between line and focus" in text
+    assert f"with a probability below {SIGNIFICANCE}" in text
 
 
 @pytest.mark.parametrize("name", builtin_cages())
