@@ -20,6 +20,7 @@ SHEAR: Final = 0.025  # largest half anisotropy or half shear
 NEAR_MM: Final = 1.2  # an affine map leaves a tilted film's perspective: 2 deg on 200 mm are 0.7 mm
 SAME_MM: Final = 0.8  # maps whose marks all lie closer than this are one
 SHIFT_MM: Final = 0.6  # images of two foci that are closer than this are told apart by the full model only
+FEWER: Final = 2  # marks are enough for a shifted grid: two unknowns only, and images of two foci may melt into one
 LARGEST: Final = 60  # candidate maps looked at closely
 
 
@@ -124,7 +125,7 @@ def find_grids(
         if foci == 1:
             found.append(refined)
         else:
-            found += _shifts(refined[0], images_mm, tree, fiducials_mm, least, largest_shift_mm)
+            found += _shifts(refined[0], images_mm, tree, fiducials_mm, max(4, least - FEWER), largest_shift_mm)
     grids = _distinct(found, fiducials_mm, SAME_MM)[:LARGEST]
     return [(affine[:2].T, affine[2], count) for affine, count in grids]
 

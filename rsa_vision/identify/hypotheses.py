@@ -18,6 +18,7 @@ from rsa_vision.types import Float, Int
 LARGEST_GAP_MM: Final = 45.0
 FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than allowed, to say `focus-far` rather than `not found`
 WEIGHED: Final = 10  # hypotheses that are fitted
+MELTED: Final = 0.5  # of the control points of a focus may be hidden, or melted into images of another focus
 OVERLAP: Final = 0.5  # of the fiducial marks must lie on others after a move that could be mistaken
 
 _Place = tuple[Float, Float, Float, Int]  # film from plane (A, b), focus, image of every mark

@@ -23,6 +23,8 @@ SLACK_MM: Final = (0.004, 0.08)  # of film, scanner and cage, each coordinate; S
 USUAL_SLACK_MM: Final = 0.02  # weighs like USUAL_COUNT coordinates
 USUAL_COUNT: Final = 6
 STAGES_MM: Final = (0.6, 0.15)  # slack while the model settles
+SETTLED_MM: Final = 0.02
+SETTLING: Final = 8  # rounds of naming and fitting at most, until the names stay
 NEAR_MM: Final = 1.0  # images further apart than this are never one
 LEAST_GAP_MM: Final = -0.1  # the film lies behind the plane: with the foci exchanged it would lie before
 GATE: Final = 16.0  # squared distance in sigma
@@ -155,7 +157,7 @@ def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float, 
     slack = STAGES_MM[0]
     fitted: Fit | None = None
     looks = appearance(scene, start, images)
-    for stage in (*STAGES_MM, None, None, None):
+    for stage in (*STAGES_MM, *[None] * SETTLING):
         slack = stage if stage is not None else slack
         gain = gains(scene, parameters, images, looks, slack)
         if banned is not None:
@@ -176,8 +178,9 @@ def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float, 
                 slack = residual_slack(fitted, images.covariance_mm2[image[rows]], slack)
         except np.linalg.LinAlgError:
             return None
+        moved = np.abs(project(scene, fitted.parameters) - project(scene, parameters)).max()
         parameters = fitted.parameters
-        if settled:
+        if settled and moved < SETTLED_MM:
             break
         if stage is not None and parameters[6] < 0:
             parameters = parameters * np.where(np.arange(len(parameters)) == 6, -1.0, 1.0)
