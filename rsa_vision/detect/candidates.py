@@ -22,6 +22,7 @@ MARGIN = 128  # overlap of bands; more than the reach of the coarsest filter
 BLOCK = 32  # side of the blocks of one pyramid level over which the spread is measured
 # (pyramid level, inner sigma, outer sigma in pixels of that level, radius in film pixels that answers best)
 SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
+ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
 JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for
 
 
@@ -131,7 +132,7 @@ def _extrema(answer: NDArray[Any], limit: NDArray[Any], level: int, radius: floa
 def _white_spread(noise: NoiseModel, level: int, inner: float, outer: float) -> float:
     """Spread of a filter's answer to white noise of the film's smallest variance."""
     gain = 1 / (4 * np.pi * inner**2) + 1 / (4 * np.pi * outer**2) - 1 / (np.pi * (inner**2 + outer**2))
-    return float(np.sqrt(noise.variance.min() * gain) / 2**level)
+    return float(np.sqrt((noise.variance.min() + ROUNDING) * gain) / 2**level)
 
 
 def _local_spread(answer: NDArray[Any], least: float) -> NDArray[Any]:

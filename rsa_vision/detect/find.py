@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ def fit_at(
     optics : Optics
     noise : NoiseModel
     others : callable, optional
-        ``others(i, cols, rows)``: images of the neighbours of ball ``i`` at these pixels.
+        ``others(i, cols, rows)``: images of the neighbours of ball ``i`` at these pixels, and where they are not to be trusted.
     quick : bool
         As of :func:`rsa_vision.detect.balls.fit_balls`.
 
@@ -60,12 +60,12 @@ def fit_at(
         extra = None
         if others is not None:
             grid = np.arange(patches.size)
-            extra = np.stack(
-                [
-                    others(i, *np.meshgrid(grid + corner[0], grid + corner[1]))
-                    for i, corner in zip(index, patches.corner_px.astype(np.float64), strict=True)
-                ]
-            )
+            near = [
+                others(i, *np.meshgrid(grid + corner[0], grid + corner[1]))
+                for i, corner in zip(index, patches.corner_px.astype(np.float64), strict=True)
+            ]
+            extra = np.stack([image for image, _ in near])
+            patches = replace(patches, valid=patches.valid & ~np.stack([doubtful for _, doubtful in near]))
         parts.append(fit_balls(patches, position_px[index], radius_px[index], optics.sigma_px, optics.mu_px, noise, extra, quick=quick))
         order.append(index)
     fits = join(parts)

@@ -15,7 +15,7 @@ from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.find import Optics, distinct, fit_at, plausible, significance
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
 Background = Callable[[Float, Float], Float]
 """Images of the tees at pixels (cols, rows), in film values."""
@@ -49,25 +49,30 @@ def resolve_balls(
     touching : ndarray of bool, shape (n,)
         Fitted together with a neighbour.
     """
-    others = None if tees is None else lambda _i, cols, rows: tees(cols, rows)
-    single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise) if len(seeds.depth) else seeds
+    if len(seeds.depth) == 0:
+        return seeds, np.zeros(0, bool)
+    others = None if tees is None else lambda _i, cols, rows: (tees(cols, rows), np.zeros(cols.shape, bool))
+    single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     good = single.rows(plausible(single, noise, slack=1.5))
     groups, fits = _groups(good, optics), []
-    tried = _unexplained_pairs(candidates, good, optics)
-    for members in tried:
-        position, radius = members[:, :2], members[:, 2]
-        pair = fit_group(film, position, radius, optics.sigma_px, optics.mu_px, noise, tees)
+    for members in _unexplained_pairs(film, candidates, good, optics):
+        pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, good)))
-    alone = [g[0] for g in groups if len(g) == 1]
-    if alone:
-        index = np.array(alone)
-        fits.append(fit_at(film, good.position_px[index], good.radius_px[index], optics, noise, others))
-    for g in groups:
+    known = good
+    for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
+        index = np.array(g)
         if 1 < len(g) <= _MOST_IN_GROUP:
-            index = np.array(g)
-            fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, tees))
+            beside = _beside(known, index, optics, tees)
+            fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, beside))
         elif len(g) > _MOST_IN_GROUP:
-            fits.append(_peel(film, good.rows(np.array(g)), optics, noise, tees))
+            fits.append(_peel(film, good.rows(index), optics, noise, tees))
+    alone = np.array([g[0] for g in groups if len(g) == 1], dtype=np.intp)
+    if len(alone):
+
+        def neighbours(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+            return _images(known, alone[[i]], optics, tees, cols, rows)
+
+        fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
     if not fits:
         return single.rows(np.zeros(len(single.depth), bool)), np.zeros(0, bool)
     found = join(fits)
@@ -103,13 +108,35 @@ def _groups(fits: BallFits, optics: Optics) -> list[list[int]]:
     return [np.nonzero(label == k)[0].tolist() for k in range(label.max() + 1)]
 
 
-def _unexplained_pairs(candidates: Candidates, good: BallFits, optics: Optics) -> list[Float]:
-    """Starts (col, row, radius) of groups that single fits did not explain: peaks of the finest filter that have company."""
+def _beside(known: BallFits, members: Int, optics: Optics, tees: Background | None) -> Background:
+    return lambda cols, rows: _images(known, members, optics, tees, cols, rows)[0]
+
+
+def _images(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
+    """Images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
+    total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
+    doubtful = np.zeros(cols.shape, bool)
+    reach = known.radius_px + 4 * optics.sigma_px
+    low, high = np.array([cols.min(), rows.min()]), np.array([cols.max(), rows.max()])
+    near = ((known.position_px > low - reach[:, None]) & (known.position_px < high + reach[:, None])).all(1)
+    near[members] = False
+    for j in np.nonzero(near)[0]:
+        dx, dy = cols - known.position_px[j, 0], rows - known.position_px[j, 1]
+        image = ball_image(dx.reshape(1, -1), dy.reshape(1, -1), known.radius_px[[j]], optics.sigma_px, optics.mu_px)
+        total = total + known.depth[j] * image.reshape(cols.shape)
+        doubtful |= np.hypot(dx, dy) < known.radius_px[j] + optics.sigma_px
+    return total, doubtful
+
+
+def _unexplained_pairs(film: NDArray[Any], candidates: Candidates, good: BallFits, optics: Optics) -> list[Float]:
     if len(good.depth) == 0:
         return []
     typical = float(np.median(good.radius_px))
     fine = np.nonzero(candidates.radius_px <= 3.0)[0] if typical < 6 else np.arange(len(candidates.strength))
     peaks = candidates.position_px[fine]
+    if len(peaks) == 0:
+        return []
+    peaks = peaks[_deep(film, peaks, typical) > 0.4 * np.median(np.abs(good.depth))]
     if len(peaks) == 0:
         return []
     free = np.min(np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1)), axis=1) > 0.6 * typical
@@ -130,19 +157,25 @@ def _unexplained_pairs(candidates: Candidates, good: BallFits, optics: Optics) -
     return out[:200]
 
 
+def _deep(film: NDArray[Any], peaks: Float, radius: float) -> Float:
+    """How far the film at these places differs from the median of a ring well outside a ball there."""
+    angle = 2 * np.pi * np.arange(16) / 16
+    reach = 2 * radius + 3
+    cols = np.rint(peaks[:, :1] + reach * np.cos(angle)).astype(np.intp).clip(0, film.shape[1] - 1)
+    rows = np.rint(peaks[:, 1:] + reach * np.sin(angle)).astype(np.intp).clip(0, film.shape[0] - 1)
+    col, row = np.rint(peaks).astype(np.intp).T
+    middle = film[row.clip(0, film.shape[0] - 1), col.clip(0, film.shape[1] - 1)].astype(np.float64)
+    out: Float = np.abs(middle - np.median(film[rows, cols], axis=1))
+    return out
+
+
 def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
     """Fit a large crowd one by one, each with the images of all others subtracted, until they settle."""
     for _ in range(4):
         last = fits
 
-        def others(i: int, cols: Float, rows: Float, last: BallFits = last) -> Float:
-            total = np.zeros_like(cols) if tees is None else tees(cols, rows)
-            for j in range(len(last.depth)):
-                dx, dy = cols - last.position_px[j, 0], rows - last.position_px[j, 1]
-                if j != i and min(np.abs(dx).min(), np.abs(dy).min()) < 20:
-                    image = ball_image(dx.reshape(1, -1), dy.reshape(1, -1), last.radius_px[[j]], optics.sigma_px, optics.mu_px)
-                    total = total + last.depth[j] * image.reshape(cols.shape)
-            return total
+        def others(i: int, cols: Float, rows: Float, last: BallFits = last) -> tuple[Float, Bool]:
+            return _images(last, np.array([i]), optics, tees, cols, rows)[0], np.zeros(cols.shape, bool)
 
         fits = fit_at(film, fits.position_px, fits.radius_px, optics, noise, others)
     return fits
