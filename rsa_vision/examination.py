@@ -163,7 +163,8 @@ def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) 
         # the rays' second points lie as far away as the origin of the calibration
         scale[focus] = float(np.linalg.norm(camera.translation) / camera.matrix[0, 0])
     bundle = joined_rays(bundles)
-    pairing = _pair(table, bundle, scale, study, None)
+    slack_mm = study.limits.calibration_px * float(np.sqrt(2) * np.mean(list(scale.values())))
+    pairing = _pair(table, bundle, scale, study, None, slack_mm)
     nothing = table.with_points(table.points.rows(~everything), table.rows[:0])
     complete = name_objects(nothing, table, bundle, pairing, ~everything)
     findings = _pair_findings(pairing, study) + lonely_images(table, pairing, bundle)
@@ -173,11 +174,12 @@ def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) 
     return _judged(complete, reconstruction, findings + judge(reconstruction, {}, study.limits))
 
 
-def _pair(table: Readings, bundle: RayBundle, mm_per_px: Mapping[int, float], study: Study, region: Region | None) -> Pairing:
+def _pair(
+    table: Readings, bundle: RayBundle, mm_per_px: Mapping[int, float], study: Study, region: Region | None, slack_mm: float | None = None
+) -> Pairing:
     scale = np.array([mm_per_px[int(focus)] for focus in bundle.focus])
-    return pair_rays(
-        bundle, study.limits, region=region, radius_mm=table.radius_px[bundle.image] * scale, contrast=table.contrast[bundle.image]
-    )
+    radius_mm, contrast = table.radius_px[bundle.image] * scale, table.contrast[bundle.image]
+    return pair_rays(bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, slack_mm=slack_mm)
 
 
 def _pair_findings(pairing: Pairing, study: Study) -> list[Finding]:

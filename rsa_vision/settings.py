@@ -30,6 +30,9 @@ class Limits(Frozen):
     line_mm: Annotated[float, Field(gt=0)] = 2.0  # selvik.md 2, step 2 (8 x 250 um)
     focus_mm: Annotated[float, Field(gt=0)] = 150.0  # how far a focus may be from nominal
     crossing_sigma: Annotated[float, Field(gt=0)] = 5.0  # crossing line error in units of its own sigma
+    calibration_px: Annotated[float, Field(ge=0)] = (
+        0.5  # pairing tolerates this error of calibrated cameras; published ones reach 0.2 to 0.3
+    )
     parallax_um: Annotated[float, Field(gt=0)] = 100.0  # mean y-parallax that shows film bending (selvik.md 2, table 5)
     posterior: Annotated[float, Field(gt=0.5, lt=1)] = 0.999  # an identity below it is ambiguous
     e_rb_mm: Annotated[float, Field(gt=0)] = 0.35  # ISO 16087

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.special import chdtrc
 
 from rsa_vision.cages import Cage
 from rsa_vision.errors import CalibrationError, GeometryError
@@ -16,9 +17,22 @@ from rsa_vision.geometry.rays import RayBundle, intersect_lines, intersection_ja
 from rsa_vision.settings import Limits
 from rsa_vision.types import Float, FocusSolution, ImagePoints, Int, Markers, Reconstruction
 
-__all__ = ["ControlCheck", "FocusFit", "check_controls", "rays_of", "reconstruct", "reconstruct_calibrated", "solve_focus"]
+__all__ = [
+    "ControlCheck",
+    "FocusFit",
+    "calibration_error",
+    "check_controls",
+    "rays_of",
+    "reconstruct",
+    "reconstruct_calibrated",
+    "solve_focus",
+]
 
 DERIVED = MarkerFlag.REJECTED | MarkerFlag.LARGE_RESIDUAL | MarkerFlag.ONE_VIEW | MarkerFlag.NO_COVARIANCE  # set anew here
+
+_LEAST_FOR_CALIBRATION = 5  # markers that can tell an error of the calibration
+_CALIBRATION_P = 0.01  # significance from which crossing errors count as larger than the images explain
+_MEDIAN_CHI2 = 0.455  # of one degree of freedom
 
 Groups = dict[str, list[int]]
 
@@ -91,7 +105,7 @@ def reconstruct_calibrated(points: ImagePoints, cameras: Mapping[int, Pinhole], 
     -------
     Reconstruction
         As of :func:`reconstruct`, without a fiducial plane and controls; ``parallax_um`` is NaN, since no axis of the calibration's frame
-        is that of the foci. The calibration counts as exact.
+        is that of the foci. The calibration counts as exact, unless the crossings say otherwise: see :func:`calibration_error`.
 
     Raises
     ------
@@ -105,17 +119,53 @@ def reconstruct_calibrated(points: ImagePoints, cameras: Mapping[int, Pinhole], 
         raise CalibrationError(f"focus {missing[0]} has no camera: add its file to calibration in the study file")
     unknown = ~np.isfinite(points.covariance_px2).all(axis=(1, 2))
     flags = (points.flags & ~int(DERIVED)) | np.where(unknown, MarkerFlag.NO_COVARIANCE, MarkerFlag.NONE)
-    bundles = []
-    for focus in _foci(points):
-        rows = np.flatnonzero(points.focus == focus)
-        bundles.append(camera_rays(cameras[focus], focus, points.position_px[rows], points.covariance_px2[rows], rows))
-    bundle = _joined(bundles)
-    markers, distance, flags = _intersect(_object_groups(points, bundle), bundle, flags, limits)
+
+    def intersect(calibration_px: float) -> tuple[Markers, Float, Int]:
+        bundles = []
+        for focus in _foci(points):
+            rows = np.flatnonzero(points.focus == focus)
+            px, covariance = points.position_px[rows], points.covariance_px2[rows]
+            bundles.append(camera_rays(cameras[focus], focus, px, covariance, rows, calibration_px=calibration_px))
+        bundle = _joined(bundles)
+        return _intersect(_object_groups(points, bundle), bundle, flags, limits)
+
+    markers, distance, flags = intersect(calibration_error(lambda error_px: intersect(error_px)[0]))
     markers.parallax_um[:] = np.nan
     solutions = tuple(_camera_solution(focus, cameras[focus]) for focus in _foci(points))
-    controls = _intersect({}, bundle, flags, limits)[0]
+    controls = markers.rows(np.zeros(len(markers), bool))
     plane = np.full((len(points), 3), np.nan)
     return Reconstruction(_flagged(points, flags), plane, distance, np.isfinite(distance), solutions, markers, controls)
+
+
+def calibration_error(markers_at: Callable[[float], Markers]) -> float:
+    """Return the error of calibrated cameras that the crossing errors show, px.
+
+    Parameters
+    ----------
+    markers_at : callable
+        Markers for an assumed error of the calibration (standard deviation of each image coordinate, px).
+
+    Returns
+    -------
+    float
+        0 where the image errors explain the crossings (chi-square, p > 0.01) or fewer than five markers could tell; else the error with
+        which the median of the squared ratios of crossing errors and their standard deviations is that of chi-square.
+    """
+
+    def ratios(error_px: float) -> Float:
+        markers = markers_at(error_px)
+        ratio = (markers.crossing_um / markers.crossing_sd_um) ** 2
+        known: Float = ratio[np.isfinite(ratio)]
+        return known
+
+    exact = ratios(0.0)
+    if len(exact) < _LEAST_FOR_CALIBRATION or chdtrc(len(exact), exact.sum()) > _CALIBRATION_P:
+        return 0.0
+    low, high = 1e-3, 30.0
+    for _ in range(30):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if np.median(ratios(middle)) > _MEDIAN_CHI2 else (low, middle)
+    return float(np.sqrt(low * high)) if low > 1e-3 else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

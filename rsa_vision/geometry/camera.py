@@ -93,8 +93,8 @@ def pixel_rays(camera: Pinhole, px: Float) -> tuple[Float, Float, Float]:
     return origin, through, np.broadcast_to(depth * inverse[:, :2], (len(px), 3, 2))
 
 
-def camera_rays(camera: Pinhole, focus: int, px: Float, covariance_px2: Float, image: Int) -> RayBundle:
-    """Return a bundle of rays whose errors are those of the images alone: the calibration counts as exact.
+def camera_rays(camera: Pinhole, focus: int, px: Float, covariance_px2: Float, image: Int, *, calibration_px: float = 0.0) -> RayBundle:
+    """Return a bundle of rays whose errors are those of the images and, if given, of the calibration.
 
     Parameters
     ----------
@@ -104,6 +104,8 @@ def camera_rays(camera: Pinhole, focus: int, px: Float, covariance_px2: Float, i
     covariance_px2 : ndarray of shape (n, 2, 2)
     image : ndarray of int, shape (n,)
         Rows of the table of images.
+    calibration_px : float
+        Error of the calibration, as a standard deviation of each image coordinate.
 
     Returns
     -------
@@ -111,6 +113,6 @@ def camera_rays(camera: Pinhole, focus: int, px: Float, covariance_px2: Float, i
     """
     origin, through, by_pixel = pixel_rays(camera, px)
     covariance = np.zeros((len(px), 6, 6))
-    covariance[:, :3, :3] = by_pixel @ covariance_px2 @ by_pixel.swapaxes(1, 2)
+    covariance[:, :3, :3] = by_pixel @ (covariance_px2 + calibration_px**2 * np.eye(2)) @ by_pixel.swapaxes(1, 2)
     focuses = np.full(len(px), focus, np.int64)
     return RayBundle(image, focuses, np.tile(origin, (len(px), 1)), through, covariance, np.zeros((len(px), 6, 0)))
