@@ -79,8 +79,14 @@ def misfit(fits: BallFits, noise: NoiseModel) -> Float:
 
 
 def significance(fits: BallFits) -> Float:
-    """Return depth over its standard deviation, shape (n,)."""
-    return np.abs(fits.depth) / np.sqrt(np.maximum(fits.covariance[:, 3, 3], 1e-30))
+    """Return depth over its standard deviation at the fitted centre and radius, shape (n,).
+
+    Radius and depth of a ball that is small against the blur can stand for each other, so that neither is sure alone: that something is there is.
+    """
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", fits.covariance), 1e-30))
+    correlation = fits.covariance / (scale[:, :, None] * scale[:, None, :])
+    precision = np.linalg.pinv(correlation, hermitian=True)[:, 3, 3] / scale[:, 3] ** 2
+    return np.abs(fits.depth) * np.sqrt(np.maximum(precision, 0.0))
 
 
 def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:

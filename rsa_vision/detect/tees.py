@@ -15,6 +15,7 @@ from rsa_vision.detect.find import EXPLAINED, MISFIT, Optics, refine
 from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles, needle_image, thick_ends
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.templates import find_like
+from rsa_vision.detect.twins import split_twins
 from rsa_vision.types import Bool, Float
 
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
@@ -50,6 +51,12 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
         tees = _distinct(_fit_all(film, tees, optics, noise, ends=True), models[0])
     if not tees:
         return [], optics
+    around = tees
+
+    def beside(mine: list[NeedleFit]) -> Any:
+        return _others(mine, [t for t in around if all(t is not m for m in mine)], optics, ends=True)
+
+    tees = split_twins(film, tees, optics, noise, is_tee, beside)
     optics = _attenuation(film, tees, optics, noise)
     tees = _fit_all(film, tees, optics, noise, ends=True)
     offsets, error = _common_directions(film, tees, optics, noise)
