@@ -56,7 +56,7 @@ def split_twins(
     for tee in tees:
         if is_tee(tee):
             continue
-        model = min(clean, key=lambda c, t=tee: abs(c.shape.length_px - t.shape.length_px))  # type: ignore[misc]  # bound per turn
+        model = clean[int(np.argmin([abs(c.shape.length_px - tee.shape.length_px) for c in clean]))]
         pair = _split(film, tee, model, offsets, optics, noise, is_tee, others([tee]))
         out += pair or [tee]
         if pair:
