@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import re
+import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -99,6 +101,30 @@ def test_numbers_of_the_method_are_those_of_the_code() -> None:
     limits = Limits()
     assert f"{limits.fiducial_um:g} µm in the plane, {limits.line_mm:g} mm between line and focus" in text
     assert f"with a probability below {SIGNIFICANCE}" in text
+
+
+@pytest.mark.parametrize("name", ["method.md", "architecture.md"])
+def test_modules_that_are_named_exist(name: str) -> None:
+    named = re.findall(r"`([\w/]+\.py)`", page(name))
+    known = {path.relative_to(ROOT / "rsa_vision").as_posix() for path in (ROOT / "rsa_vision").rglob("*.py")}
+    assert named
+    assert [item for item in named if not any(f"/{path}".endswith(f"/{item}") for path in known)] == []
+
+
+def test_the_picture_of_the_layers_is_the_contract() -> None:
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"][0]["layers"]
+    lines = [line[:50] for line in section("architecture.md", "Layers").splitlines()]  # what stands to the right explains
+    at = [
+        [min(i for i, line in enumerate(lines) if re.search(rf"^ .*\b{name}\b", line)) for name in layer]
+        for layer in map(modules, contract)
+    ]
+    assert all(max(upper) < min(lower) for upper, lower in pairwise(at))
+
+
+def modules(layer: str) -> list[str]:
+    """Return the modules of a layer that have a name in the picture; parts of a noun (`cage_checks`) go with it."""
+    names = re.findall(r"rsa_vision\.(\w+)", layer)
+    return [name for name in names if not any(name.startswith(f"{other.removesuffix('s')}_") for other in names)]
 
 
 @pytest.mark.parametrize("name", builtin_cages())
