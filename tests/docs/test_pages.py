@@ -98,7 +98,7 @@ def test_numbers_of_the_method_are_those_of_the_code() -> None:
     stated += [(codes(row[0])[0], row[1]) for row in rows(section("method.md", "Names of the cage's marks"))]
     assert len(stated) >= 10
     assert {name: float(value) for name, value in stated} == {name: known[name] for name, _ in stated}
-    limits = Limits()
+    text, limits = " ".join(text.split()), Limits()
     assert f"{limits.fiducial_um:g} µm in the plane, {limits.line_mm:g} mm between line and focus" in text
     assert f"with a probability below {SIGNIFICANCE}" in text
 
