@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
 from rsa_vision.detect.candidates import Candidates, find_candidates
+from rsa_vision.detect.decide import are_balls
 from rsa_vision.detect.find import (
     MISFIT,
     STRENGTH,
@@ -26,7 +27,7 @@ from rsa_vision.detect.find import (
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import estimate_optics
-from rsa_vision.detect.resolve import resolve_balls, strong_enough
+from rsa_vision.detect.resolve import resolve_balls
 from rsa_vision.detect.tees import find_tees
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
@@ -129,7 +130,7 @@ def _one_polarity(
 
     balls, touching = resolve_balls(film, mine, seeds, optics, noise, tee_images if tees else None)
     limit = significance_limit(film.size, 2.5, false_detections)
-    keep = strong_enough(balls, limit) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees)
+    keep = are_balls(balls, limit) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees)
     balls, touching = balls.rows(keep), touching[keep]
     images = _table(film, bits, balls, touching, tees, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls import BallFits, ball_image, join
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.find import Optics, distinct, fit_at, plausible, significance
+from rsa_vision.detect.find import Optics, distinct, fit_at, plausible
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float, Int
@@ -179,8 +179,3 @@ def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel,
 
         fits = fit_at(film, fits.position_px, fits.radius_px, optics, noise, others)
     return fits
-
-
-def strong_enough(fits: BallFits, limit: float) -> Bool:
-    """Say which balls noise alone would not make."""
-    return significance(fits) > limit

@@ -1,0 +1,44 @@
+"""The last decision: which fits are marks. By significance against noise and clutter, and by likeness to the sure ones of the film."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rsa_vision.detect.balls import RADIUS_PX, BallFits
+from rsa_vision.detect.find import significance
+from rsa_vision.types import Bool, Float
+
+SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
+CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
+_LEAST_PATTERNS = 3  # sure balls from which their sizes tell something of the others
+_SMALLER, _LARGER = 0.7, 1.45  # range of sizes around those of the sure ones: marks of one film are of few sizes
+
+
+def over_clutter(fits: BallFits) -> Float:
+    """Return the significance of each ball over noise and the structure around it, shape (n,)."""
+    out: Float = significance(fits) / np.sqrt(np.maximum(fits.chi2_ring, 1.0))
+    return out
+
+
+def are_balls(fits: BallFits, limit: float) -> Bool:
+    """Say which balls are marks.
+
+    Parameters
+    ----------
+    fits : BallFits
+        That look like balls.
+    limit : float
+        Significance that noise alone would exceed too often.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    strength = over_clutter(fits)
+    sure = (strength > max(SURE, limit)) & (fits.radius_px > 1.02 * RADIUS_PX[0])  # at the least radius it is a point, not a ball
+    patterns = fits.radius_px[sure & (fits.explained > CLOSE)]
+    if len(patterns) < _LEAST_PATTERNS:
+        return np.asarray(sure)
+    low, high = _SMALLER * float(patterns.min()), _LARGER * float(patterns.max())
+    alike = (fits.radius_px > low) & (fits.radius_px < high)
+    return np.asarray((significance(fits) > limit) & alike & (sure | (strength > 0.5 * SURE)))
