@@ -12,6 +12,7 @@ from scipy.special import chdtri
 from rsa_vision.types import Float
 
 TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surface, large enough to hold correlated noise
+ENOUGH_TILES = 12  # that are nowhere saturated
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
 _LEVELS = 12  # value classes of the variance curve
@@ -98,18 +99,20 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     NoiseModel
     """
     floor, ceiling = saturation(film, bits)
-    n_rows, n_cols = film.shape[0] // TILE, film.shape[1] // TILE
-    step = max(1, int(np.ceil(np.sqrt(n_rows * n_cols / MAX_TILES))))
-    tiles = film[: n_rows * TILE, : n_cols * TILE].reshape(n_rows, TILE, n_cols, TILE)[::step, :, ::step].swapaxes(1, 2)
-    tiles = tiles.reshape(-1, TILE, TILE).astype(np.float64)
-    whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
-    tiles = tiles[whole] if whole.any() else tiles
-    axis = np.linspace(-1, 1, TILE)
+    tiles = np.zeros((0, TILE, TILE))
+    for side in (TILE, TILE // 2, TILE // 4):  # a small field with shutters around has no room for large ones
+        tiles = _tiles(film, min(side, *film.shape))
+        whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
+        if np.count_nonzero(whole) >= ENOUGH_TILES:
+            break
+    tiles = (tiles[whole] if whole.any() else tiles).astype(np.float64)
+    side = tiles.shape[1]
+    axis = np.linspace(-1, 1, side)
     gx, gy = np.meshgrid(axis, axis)
     basis = np.linalg.qr(np.stack([b.ravel() for b in (np.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy)], axis=1))[0]
     flat = tiles.reshape(len(tiles), -1)
     rest = flat - (flat @ basis) @ basis.T
-    dof = TILE * TILE - basis.shape[1]
+    dof = side * side - basis.shape[1]
     variance = np.einsum("ij,ij->i", rest, rest) / dof
     mean = flat.mean(1)
     order = np.argsort(mean)
@@ -121,21 +124,29 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         quiet.append(chosen)
     chosen = np.concatenate(quiet)
     correlation, hidden = _correlation(rest[chosen], variance[chosen])
-    independent = (TILE * TILE - basis.shape[1]) / max(float((correlation**2).sum()), 1.0)
+    independent = dof / max(float((correlation**2).sum()), 1.0)
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     level_array, curve_array = np.array(level), np.maximum(np.array(curve) / bias, _QUANTISATION)
     ranked = np.argsort(level_array)
     return NoiseModel(level_array[ranked], curve_array[ranked], correlation, floor, ceiling)
 
 
+def _tiles(film: NDArray[Any], side: int) -> NDArray[Any]:
+    """Tiles spread evenly over a film, shape (n, side, side)."""
+    n_rows, n_cols = film.shape[0] // side, film.shape[1] // side
+    step = max(1, int(np.ceil(np.sqrt(n_rows * n_cols / MAX_TILES))))
+    tiles = film[: n_rows * side, : n_cols * side].reshape(n_rows, side, n_cols, side)[::step, :, ::step].swapaxes(1, 2)
+    return tiles.reshape(-1, side, side)
+
 
 def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
-    tiles = (rest / np.sqrt(np.maximum(variance, 1e-12))[:, None]).reshape(-1, TILE, TILE)
-    size = 2 * TILE
+    side = round(np.sqrt(rest.shape[1]))
+    tiles = (rest / np.sqrt(np.maximum(variance, 1e-12))[:, None]).reshape(-1, side, side)
+    size = 2 * side
     spectrum = np.abs(np.fft.rfft2(tiles, s=(size, size))) ** 2
     sums = np.fft.irfft2(spectrum.mean(0), s=(size, size))
     lag = np.arange(-LAGS, LAGS + 1)
-    pairs = (TILE - np.abs(lag))[:, None] * (TILE - np.abs(lag))[None, :]
+    pairs = (side - np.abs(lag))[:, None] * (side - np.abs(lag))[None, :]
     auto = sums[np.ix_(lag % size, lag % size)] / pairs
     auto = auto / auto[LAGS, LAGS]
     return _smooth_correlation(auto)
