@@ -7,12 +7,13 @@ import re
 import tomllib
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rsa_vision import errors, readings, verdict
 from rsa_vision.cage_drawing import draw_cage
-from rsa_vision.cages import builtin_cages, load_cage, symmetries
+from rsa_vision.cages import Cage, Mark, Plane, builtin_cages, load_cage, symmetries
 from rsa_vision.flags import REASONS, MarkerFlag, flag_names
 from rsa_vision.geometry.covariance import SIGNIFICANCE
 from rsa_vision.identify import film_model
@@ -101,6 +102,26 @@ def test_numbers_of_the_method_are_those_of_the_code() -> None:
     text, limits = " ".join(text.split()), Limits()
     assert f"{limits.fiducial_um:g} µm in the plane, {limits.line_mm:g} mm between line and focus" in text
     assert f"with a probability below {SIGNIFICANCE}" in text
+
+
+def toml_blocks(text: str) -> list[dict[str, Any]]:
+    return [tomllib.loads(block) for block in re.findall(r"```toml\n(.*?)```", text, re.DOTALL)]
+
+
+def test_the_study_file_of_the_page_is_valid() -> None:
+    (whole,) = toml_blocks(section("quickstart.md", "study.toml"))
+    assert Study.model_validate(whole).limits == Limits()
+    for name in ("quickstart.md", "calibrated_cameras.md"):
+        for block in toml_blocks(page(name)):
+            Study.model_validate(block)
+
+
+def test_the_cage_file_of_the_page_has_valid_parts() -> None:
+    (example,) = toml_blocks(section("cages.md", "Cage files"))
+    assert set(example) <= set(Cage.model_fields)
+    for kind, name in ((Plane, "plane"), (Mark, "mark")):
+        for part in example[name]:
+            kind.model_validate(part)
 
 
 @pytest.mark.parametrize("name", ["method.md", "architecture.md"])
