@@ -130,7 +130,7 @@ def _one_polarity(
 
     balls, touching = resolve_balls(film, mine, seeds, optics, noise, tee_images if tees else None)
     limit = significance_limit(film.size, 2.5, false_detections)
-    keep = are_balls(balls, limit) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees)
+    keep = are_balls(balls, limit, optics.sigma_px) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees)
     balls, touching = balls.rows(keep), touching[keep]
     images = _table(film, bits, balls, touching, tees, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0

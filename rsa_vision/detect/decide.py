@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsa_vision.detect.balls import RADIUS_PX, BallFits
+from rsa_vision.detect.balls import BallFits
 from rsa_vision.detect.find import significance
 from rsa_vision.types import Bool, Float
 
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
+EDGE = 16.0  # more variance than this around a ball, in units of the noise, is an edge beside it; edges do not look like balls
+SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
 _LEAST_PATTERNS = 3  # sure balls from which their sizes tell something of the others
 _SMALLER, _LARGER = 0.7, 1.45  # range of sizes around those of the sure ones: marks of one film are of few sizes
 
 
 def over_clutter(fits: BallFits) -> Float:
     """Return the significance of each ball over noise and the structure around it, shape (n,)."""
-    out: Float = significance(fits) / np.sqrt(np.maximum(fits.chi2_ring, 1.0))
+    out: Float = significance(fits) / np.sqrt(np.clip(fits.chi2_ring, 1.0, EDGE))
     return out
 
 
-def are_balls(fits: BallFits, limit: float) -> Bool:
+def are_balls(fits: BallFits, limit: float, sigma_px: float) -> Bool:
     """Say which balls are marks.
 
     Parameters
@@ -29,13 +31,16 @@ def are_balls(fits: BallFits, limit: float) -> Bool:
         That look like balls.
     limit : float
         Significance that noise alone would exceed too often.
+    sigma_px : float
+        Blur of the film.
 
     Returns
     -------
     ndarray of bool, shape (n,)
     """
     strength = over_clutter(fits)
-    sure = (strength > max(SURE, limit)) & (fits.radius_px > 1.02 * RADIUS_PX[0])  # at the least radius it is a point, not a ball
+    spot = np.hypot(sigma_px, 0.5 * fits.radius_px) < SPOT_PX
+    sure = (strength > max(SURE, limit)) & ~spot
     patterns = fits.radius_px[sure & (fits.explained > CLOSE)]
     if len(patterns) < _LEAST_PATTERNS:
         return np.asarray(sure)

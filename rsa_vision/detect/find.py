@@ -104,7 +104,7 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     ndarray of bool, shape (n,)
     """
     # little is left of the window beside a saturated area: enough if the ball itself is whole
-    seen = ((fits.valid_fraction > 0.3) & (fits.window_fraction > 0.5)) | ((fits.valid_fraction > 0.8) & (fits.window_fraction > 0.08))
+    seen = ((fits.valid_fraction > 0.3) & (fits.window_fraction > 0.5)) | ((fits.valid_fraction > 0.6) & (fits.window_fraction > 0.05))
     usable = seen & np.isfinite(fits.position_px).all(1)
     return usable & (misfit(fits, noise) < MISFIT * slack) & (fits.explained > 1 - (1 - EXPLAINED) * slack) & (significance(fits) > 5.0)
 
