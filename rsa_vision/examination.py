@@ -19,7 +19,7 @@ from rsa_vision.identify.pairs import Pairing, Region, cage_region, pair_rays
 from rsa_vision.images import require_pitch
 from rsa_vision.readings import FilmReading, Readings, candidates, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Study
-from rsa_vision.types import Film, ImagePoints, Int, Reconstruction
+from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
 from rsa_vision.xray import rays_of, reconstruct, reconstruct_calibrated, solve_focus
 
@@ -141,7 +141,9 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
     centre = named.points.position_px.mean(axis=0)
     scale = {focus: local_scale(fit.plane_from_film, centre) for focus, fit in fits.items()}
     region = cage_region(cage, {focus: fit.position_mm for focus, fit in fits.items()})
-    pairing = _pair(table, bundle, scale, study, region)
+    normals = np.array([cage.plane_of(int(focus)).normal() for focus in bundle.focus])
+    slant = np.abs(np.einsum("ij,ij->i", bundle.direction, normals))
+    pairing = _pair(table, bundle, scale, study, region, slant=slant)
     complete = name_objects(named, table, bundle, pairing, foreign)
     reconstruction = reconstruct(complete.points, cage, study.limits)
     findings += _pair_findings(pairing, study) + lonely_images(table, pairing, bundle)
@@ -175,10 +177,19 @@ def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) 
 
 
 def _pair(
-    table: Readings, bundle: RayBundle, mm_per_px: Mapping[int, float], study: Study, region: Region | None, slack_mm: float | None = None
+    table: Readings,
+    bundle: RayBundle,
+    mm_per_px: Mapping[int, float],
+    study: Study,
+    region: Region | None,
+    slack_mm: float | None = None,
+    *,
+    slant: Float | None = None,
 ) -> Pairing:
     scale = np.array([mm_per_px[int(focus)] for focus in bundle.focus])
     radius_mm, contrast = table.radius_px[bundle.image] * scale, table.contrast[bundle.image]
+    if slant is not None:  # a ball seen at a slant is an ellipse, longer by 1 / cos: the fitted radius is the geometric mean
+        radius_mm = radius_mm * np.sqrt(slant)
     return pair_rays(bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, slack_mm=slack_mm)
 
 
