@@ -28,7 +28,7 @@ SLACK_EVIDENCE: Final = 5.0  # log likelihood by which a slack must be better th
 LEARNT_FROM: Final = 5  # pairs beyond doubt that teach what pairs look like
 SURE: Final = 0.99
 PRIOR: Final = (0.02, 0.95)  # bounds of the learnt fraction of rays that have a partner
-FEATURES: Final = (("size", 0.004, 0.2), ("size ratio", 0.004, 0.2), ("contrast ratio", 0.03, 0.4))  # least sd, sd of unrelated images; logs
+FEATURES: Final = (("size", 0.01, 0.2), ("size ratio", 0.01, 0.2), ("contrast ratio", 0.03, 0.4))  # least sd, sd of unrelated images; logs
 UNKNOWN: Final = 5.0  # unrelated crossings that a guess of their looks weighs like
 MOST_GROUPS: Final = 20_000
 
