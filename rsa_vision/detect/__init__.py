@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
 from rsa_vision.detect.candidates import Candidates, find_candidates
-from rsa_vision.detect.decide import are_balls
+from rsa_vision.detect.decide import EDGE, are_balls
 from rsa_vision.detect.find import (
     MISFIT,
     STRENGTH,
@@ -34,6 +34,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 
 __all__ = ["Detection", "detect_markers"]
 
+STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 
 
@@ -159,6 +160,8 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     core_n = np.pi * (balls.radius_px + 1) ** 2
     # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
     excess = np.where(balls.chi2_uneven > 1 + 3 * np.sqrt(2 / core_n), balls.chi2_uneven, 1.0)
+    # structure around a ball that the quadratic background does not hold goes on under it
+    excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 1.0))
     covariance = np.concatenate(
         [balls.covariance[:, :2, :2] * excess[:, None, None], np.array([t.covariance_px2 * _excess(t) for t in tees]).reshape(-1, 2, 2)]
     )
@@ -174,6 +177,7 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     flags[valid < 0.8] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
     poor = np.concatenate([misfit(balls, noise), [t.misfit for t in tees]]) > 0.6 * MISFIT
+    poor[:n] |= balls.chi2_ring > EDGE
     flags[poor] |= MarkerFlag.POOR_FIT
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")

@@ -10,6 +10,7 @@ from rsa_vision.types import Bool, Float
 
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
+FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
 EDGE = 16.0  # more variance than this around a ball, in units of the noise, is an edge beside it; edges do not look like balls
 SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
 _LEAST_PATTERNS = 3  # sure balls from which their sizes tell something of the others
@@ -41,9 +42,12 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float) -> Bool:
     strength = over_clutter(fits)
     spot = np.hypot(sigma_px, 0.5 * fits.radius_px) < SPOT_PX
     sure = (strength > max(SURE, limit)) & ~spot
-    patterns = fits.radius_px[sure & (fits.explained > CLOSE)]
+    pattern = sure & (fits.explained > CLOSE)
+    patterns = fits.radius_px[pattern]
     if len(patterns) < _LEAST_PATTERNS:
         return np.asarray(sure)
+    height = np.abs(fits.depth) * -np.expm1(-0.5 * (fits.radius_px / sigma_px) ** 2)  # of the blurred image, roughly
+    sure &= height > FAINT * np.median(height[pattern])
     low, high = _SMALLER * float(patterns.min()), _LARGER * float(patterns.max())
-    alike = (fits.radius_px > low) & (fits.radius_px < high)
+    alike = (fits.radius_px > low) & (fits.radius_px < high) & (height > FAINT * np.median(height[pattern]))
     return np.asarray((significance(fits) > limit) & alike & (sure | (strength > 0.5 * SURE)))
