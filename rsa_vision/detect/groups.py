@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, polynomial, uneven
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
@@ -15,10 +16,19 @@ from rsa_vision.types import Float
 
 _STEPS = 25
 _CONVERGED_PX = 1e-3
+KNOTS = 1.5  # blur widths between the knots of a profile across an edge
 
 
 def fit_group(
-    film: NDArray[Any], start_px: Float, start_radius_px: Float, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None
+    film: NDArray[Any],
+    start_px: Float,
+    start_radius_px: Float,
+    sigma_px: float,
+    mu_px: float,
+    noise: NoiseModel,
+    others: Any = None,
+    *,
+    edge: bool = False,
 ) -> BallFits:
     """Fit several balls in one window on one background.
 
@@ -32,6 +42,8 @@ def fit_group(
     noise : NoiseModel
     others : callable, optional
         ``others(cols, rows)``: images of neighbours outside the group, subtracted first.
+    edge : bool
+        The background also holds an edge: any profile across the direction in which the window changes most (:func:`edge_profile`).
 
     Returns
     -------
@@ -65,6 +77,11 @@ def fit_group(
     value, d_col, d_row, d_radius = model()
     linear = np.column_stack([*value, surface])
     theta = weighted_least_squares(linear, weight, data, 1e-6)
+    if edge:
+        bare = (data - value.T @ theta[:k]).reshape(patch.size, patch.size)
+        surface = np.column_stack([surface, edge_profile(bare, valid.reshape(bare.shape), sigma_px)])
+        linear = np.column_stack([*value, surface])
+        theta = weighted_least_squares(linear, weight, data, 1e-6)
     converged = False
     for step in range(_STEPS + 1):
         depth = theta[:k, None]
@@ -108,3 +125,38 @@ def fit_group(
         background=np.full(k, theta[k]),
         converged=np.full(k, converged),
     )
+
+
+def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
+    """Return functions that together make any smooth profile across the strongest edge of a window.
+
+    The edge of a bone or an implant is straight over the width of a ball: it changes across, not along. A ball changes both ways, so its centre
+    stays determined, if less well across the edge; the covariance knows.
+
+    Parameters
+    ----------
+    bare : ndarray of shape (s, s)
+        The window without its balls.
+    valid : ndarray of shape (s, s)
+        1, or 0 where masked.
+    sigma_px : float
+        Blur of the film: nothing changes faster.
+
+    Returns
+    -------
+    ndarray of shape (s * s, p)
+        Cubic B-splines of the coordinate across the edge.
+    """
+    weight = gaussian_filter(valid, 1.0)
+    smooth = gaussian_filter(bare * valid, 1.0) / np.maximum(weight, 1e-6)
+    by_row, by_col = np.gradient(smooth)
+    inside = valid * (weight > 0.9)
+    tensor = np.array([[(inside * a * b).sum() for b in (by_col, by_row)] for a in (by_col, by_row)])
+    across = np.linalg.eigh(tensor)[1][:, 1]
+    rows, cols = np.mgrid[0 : len(bare), 0 : len(bare)] - (len(bare) - 1) / 2
+    t = (cols * across[0] + rows * across[1]).ravel()
+    step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
+    distance = np.abs(t[:, None] - np.arange(t.min(), t.max() + step, step)) / step
+    near, far = 2 / 3 - distance**2 + distance**3 / 2, np.maximum(2 - distance, 0) ** 3 / 6
+    columns: Float = np.where(distance < 1, near, far)
+    return columns

@@ -114,7 +114,7 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     rest = flat - (flat @ basis) @ basis.T
     dof = side * side - basis.shape[1]
     variance = np.einsum("ij,ij->i", rest, rest) / dof
-    mean = flat.mean(1)
+    mean = np.median(flat, axis=1)  # a mark in a tile must not make it a level of its own
     order = np.argsort(mean)
     level, curve, quiet = [], [], []
     for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
@@ -148,7 +148,8 @@ def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
     lag = np.arange(-LAGS, LAGS + 1)
     pairs = (side - np.abs(lag))[:, None] * (side - np.abs(lag))[None, :]
     auto = sums[np.ix_(lag % size, lag % size)] / pairs
-    auto = auto / auto[LAGS, LAGS]
+    centre = auto[LAGS, LAGS]
+    auto = auto / centre if centre > 0 else (lag[:, None] == 0) * (lag[None, :] == 0) * 1.0
     return _smooth_correlation(auto)
 
 
