@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls import BallFits, ball_image, join
+from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.find import Optics, distinct, fit_at, plausible
 from rsa_vision.detect.groups import fit_group
@@ -60,6 +61,20 @@ def resolve_balls(
     for members in _unexplained_pairs(film, candidates, good, optics):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, good)))
+    sure = good.rows(plausible(good, noise))
+    nobody = np.arange(0)
+    pairs = split_blobs(
+        film,
+        single.rows(~plausible(single, noise) & ~_taken(single, sure)),
+        sure,
+        optics,
+        noise,
+        lambda: _beside(sure, nobody, optics, tees),
+    )
+    fits += pairs
+    if pairs:  # a blob that two balls explain is no ball
+        good = good.rows(~_taken(good, join(pairs)))
+        groups = _groups(good, optics)
     known = good
     for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
         index = np.array(g)
@@ -113,6 +128,14 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
         covariance[:, :2, :2] += 0.25 * shift[:, :, None] * shift[:, None, :]
         parts.append(replace(edged, covariance=covariance))
     return join(parts) if parts else fits
+
+
+def _taken(fits: BallFits, good: BallFits) -> Bool:
+    """Say which fits lie on a ball that is already known."""
+    if len(good.depth) == 0:
+        return np.zeros(len(fits.depth), bool)
+    gap = np.hypot(*(fits.position_px[:, None] - good.position_px[None]).transpose(2, 0, 1))
+    return np.asarray((gap < 0.6 * good.radius_px[None]).any(axis=1))
 
 
 def _like(fits: BallFits, known: BallFits) -> Bool:
