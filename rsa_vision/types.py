@@ -77,7 +77,7 @@ class MarkerImages(Table):
         Pin: direction from the tip to the thick end. Tee: direction of the stem (the arm without an opposite). Counter-clockwise from +col
         as displayed (row down): ``atan2(-drow, dcol)``. NaN for balls.
     contrast : ndarray of shape (n,)
-        Fitted depth of the image, as a fraction of the background exposure (0..1), positive for every marker.
+        Fitted depth of the image, as a part of the film's full scale; positive for either polarity.
     snr : ndarray of shape (n,)
         Contrast over the noise of one pixel.
     flags : ndarray of int, shape (n,)

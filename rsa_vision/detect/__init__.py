@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
 from rsa_vision.detect.find import (
@@ -24,11 +24,12 @@ from rsa_vision.detect.find import (
     significance,
     significance_limit,
 )
+from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import estimate_optics
 from rsa_vision.detect.resolve import resolve_balls
-from rsa_vision.detect.tees import find_tees
+from rsa_vision.detect.tees import find_tees, is_tee
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
@@ -116,7 +117,7 @@ def _one_polarity(
     mine = Candidates(
         candidates.position_px[same], candidates.radius_px[same], candidates.strength[same], candidates.roundness[same], junctions
     )
-    tees, tee_optics = find_tees(film, junctions, optics, noise)
+    tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
 
     def tee_images(cols: Float, rows: Float) -> Float:
@@ -133,6 +134,13 @@ def _one_polarity(
     limit = significance_limit(film.size, 2.5, false_detections)
     keep = are_balls(balls, limit, optics.sigma_px) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees)
     balls, touching = balls.rows(keep), touching[keep]
+    for fit in doubtful:
+        if found := part(film, fit, balls, optics, tee_optics, noise, tee_images, is_tee):
+            tee, ball = found
+            apart = np.hypot(*(balls.position_px - ball.position_px[0]).T) > ball.radius_px[0]
+            balls = join([balls.rows(apart), ball])
+            touching = np.append(touching[apart], True)
+            tees = [*tees, tee]
     images = _table(film, bits, balls, touching, tees, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
@@ -188,5 +196,3 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
 
 def _excess(fit: NeedleFit) -> float:
     return fit.chi2_core if fit.chi2_core > 1 + 3 * np.sqrt(2 / max(fit.n_core, 1)) else 1.0
-
-

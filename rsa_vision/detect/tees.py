@@ -27,7 +27,9 @@ _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms 
 _ATTENUATIONS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.2)  # of the arms, relative to the balls
 
 
-def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], Optics]:
+def find_tees(
+    film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel
+) -> tuple[list[NeedleFit], list[NeedleFit], Optics]:
     """Find and fit all tees of one polarity.
 
     Parameters
@@ -40,17 +42,19 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
 
     Returns
     -------
-    list of NeedleFit, Optics
-        The optics with the attenuation that suits the arms: they are thinner than balls, and the film curve is bent.
+    tees, doubtful : list of NeedleFit
+        What are tees, and what look like tees with something else on them.
+    optics : Optics
+        With the attenuation that suits the arms: they are thinner than balls, and the film curve is bent.
     """
     models = _models(film, junctions, optics, noise)
     if not models:
-        return [], optics
+        return [], [], optics
     tees = _like(film, models, optics, noise)
     for _ in range(2):
         tees = _distinct(_fit_all(film, tees, optics, noise, ends=True), models[0])
     if not tees:
-        return [], optics
+        return [], [], optics
     around = tees
 
     def beside(mine: list[NeedleFit]) -> Any:
@@ -64,7 +68,7 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
         tees = [replace(t, angles=_mean_turn(t.angles, offsets) + offsets) for t in tees]
     # with the directions held, the slanted thick ends can no longer turn the arms: they may lend their weight
     tees = _fit_all(film, tees, optics, noise, ends=offsets is not None)
-    return [_with_error(t, error) for t in tees if is_tee(t)], optics
+    return [_with_error(t, error) for t in tees if is_tee(t)], [t for t in tees if not is_tee(t) and is_tee(t, slack=ROUGH)], optics
 
 
 def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
@@ -140,6 +144,8 @@ def _fit_all(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: N
 
 
 def _clusters(tees: list[NeedleFit]) -> list[list[NeedleFit]]:
+    if not tees:
+        return []
     position = np.array([t.position_px for t in tees])
     gap = np.hypot(*(position[:, None] - position[None]).transpose(2, 0, 1))
     length = np.array([t.shape.length_px for t in tees])
