@@ -100,7 +100,6 @@ def measure(
     orientation: Annotated[str | None, typer.Option("--orientation", help="upright, any or mirrored.")] = None,
     temperature_c: Annotated[float | None, typer.Option("--temperature-c", help="Of the cage at the exposure, degrees C.")] = None,
     file_pattern: Annotated[str | None, typer.Option("--file-pattern", help="Regular expression with subject, exam[, focus].")] = None,
-    object_diameter_mm: Annotated[float | None, typer.Option("--object-diameter-mm", help="Of the object markers, mm.")] = None,
 ) -> int:
     """Measure every examination in a folder of films, unattended."""
     from rsa_vision import api
@@ -124,7 +123,6 @@ def measure(
             orientation=orientation,
             temperature_c=temperature_c,
             file_pattern=file_pattern,
-            object_diameter_mm=object_diameter_mm,
         )
     for path, why in summary.ignored:
         if why == "no DICOM file":  # all else that is ignored could not be taken for a film

@@ -57,7 +57,6 @@ class Study(Frozen):
     orientation: Orientation = "upright"
     temperature_c: Finite | None = None
     file_pattern: str | None = None
-    object_diameter_mm: Annotated[float, Field(gt=0, lt=10)] | None = None
     foci: dict[int, Vector] = {}
     calibration: dict[int, Path] = {}
     motion: Motion = Motion()
