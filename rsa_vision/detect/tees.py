@@ -24,6 +24,8 @@ _MOST_JUNCTIONS = 80
 _MOST_TOGETHER = 4  # tees in one fit; larger sets are cut where they overlap least
 _NEAREST_PX = 3.0  # two tips nearer than this are one
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
+TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
+CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
 _ATTENUATIONS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.2)  # of the arms, relative to the balls
 
 
@@ -83,22 +85,41 @@ def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
 
 def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Fit tees at the strongest junctions until a few are clean; the cleanest first, one of each size."""
+    order = junctions[np.argsort(-np.abs(junctions[:, 4]))][:_MOST_JUNCTIONS]
     rough: list[NeedleFit] = []
-    for col, row, angle, ring, _ in junctions[np.argsort(-np.abs(junctions[:, 4]))][:_MOST_JUNCTIONS]:
-        start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring)
+    best_taper = TAPERS[0]
+    for taper in TAPERS:  # full cones first; pins with a short point leave more than cones do
+        tried = _at_junctions(film, order, taper, optics, noise)
+        if _mean_misfit(tried) < 0.8 * _mean_misfit(rough):
+            rough, best_taper = tried, taper
+        if not rough or _mean_misfit(rough) < CLEAN:
+            break
+    if not rough or not is_tee(rough[0], slack=1.5):
+        return []  # crossings of other things: not one is nearly a tee
+    rough = [f for f in rough if f.shape.taper == best_taper]
+    clean = [f for f in rough if is_tee(f)] or rough[:1]
+    sizes = sorted(clean, key=lambda f: f.shape.length_px)
+    ends = [sizes[0], sizes[-1]] if sizes[-1].shape.length_px > 1.08 * sizes[0].shape.length_px else []
+    return [clean[0], *(f for f in ends if f is not clean[0])]
+
+
+def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Fit a tee at each junction until enough are clean; best first."""
+    rough: list[NeedleFit] = []
+    for col, row, angle, ring, _ in junctions:
+        start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
         angles = angle + np.array([0.0, np.pi / 2, -np.pi / 2])
         fit = fit_needles(film, np.array([col, row]), angles, start, optics.sigma_px, optics.mu_px, noise, rigid=True)
         if is_tee(fit, slack=ROUGH):
             rough.append(fit)
         if sum(is_tee(f) for f in rough) >= ENOUGH:
             break
-    rough.sort(key=lambda f: f.misfit + 1 - f.explained)
-    if not rough or not is_tee(rough[0], slack=1.5):
-        return []  # crossings of other things: not one is nearly a tee
-    clean = [f for f in rough if is_tee(f)] or rough[:1]
-    sizes = sorted(clean, key=lambda f: f.shape.length_px)
-    ends = [sizes[0], sizes[-1]] if sizes[-1].shape.length_px > 1.08 * sizes[0].shape.length_px else []
-    return [clean[0], *(f for f in ends if f is not clean[0])]
+    return sorted(rough, key=lambda f: f.misfit + 1 - f.explained)
+
+
+def _mean_misfit(fits: list[NeedleFit]) -> float:
+    """Mean over the best few of what the model leaves; infinite for none."""
+    return float(np.mean([f.misfit + 1 - f.explained for f in fits[:3]])) if fits else np.inf
 
 
 def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
