@@ -32,7 +32,8 @@ class BallFits:
     covariance : ndarray of shape (n, 4, 4)
         Of col, row, radius and depth, for the film's noise with its correlation between pixels.
     chi2_core, chi2_ring : ndarray of shape (n,)
-        Mean squared residual in units of the noise variance, under the ball (to one blur beyond the rim) and around it.
+        Mean squared residual in units of the noise variance, under the ball (to one blur beyond the rim) and around it; the latter of the
+        odd part only, as below.
     chi2_uneven : ndarray of shape (n,)
         As ``chi2_core``, of the odd part of the residuals only: errors that are the same on opposite sides of the centre (film curve, focal
         spot, attenuation) do not move it.
@@ -195,7 +196,9 @@ def _fit_batch(
     square = weight * residual**2
     core_n = np.maximum((core * valid).sum(1), 1.0)
     chi2_core = (square * core).sum(1) / core_n
-    chi2_ring = (square * ~core).sum(1) / np.maximum((~core * valid).sum(1) - 10, 1.0)
+    chi2_ring = chi2_uneven = (square * ~core).sum(1) / np.maximum((~core * valid).sum(1) - 10, 1.0)
+    if not quick:
+        chi2_ring, chi2_uneven = (uneven(residual, weight, local, size, part) for part in (~core, core))
     raised = weight * (residual + depth * value) ** 2  # over the fitted background, as if there were no ball
     return BallFits(
         position_px=local + patches.corner_px,
@@ -204,7 +207,7 @@ def _fit_batch(
         covariance=covariance[:, :, :4],
         chi2_core=chi2_core,
         chi2_ring=chi2_ring,
-        chi2_uneven=chi2_core if quick else uneven(residual, weight, local, size, core),
+        chi2_uneven=chi2_uneven,
         explained=1.0 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
         window_fraction=valid.mean(1),

@@ -13,6 +13,7 @@ from rsa_vision.types import Float
 
 TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surface, large enough to hold correlated noise
 ENOUGH_TILES = 12  # that are nowhere saturated
+STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, and with this power of the value
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
 _LEVELS = 12  # value classes of the variance curve
@@ -122,13 +123,25 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         level.append(float(mean[chosen].mean()))
         curve.append(float(np.median(variance[chosen])))
         quiet.append(chosen)
-    chosen = np.concatenate(quiet)
+    ranked = np.argsort(level)
+    level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.array(curve)[ranked])
+    clean = curve_array >= np.array(curve)[ranked] * 0.999
+    chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])
     correlation, hidden = _correlation(rest[chosen], variance[chosen])
     independent = dof / max(float((correlation**2).sum()), 1.0)
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
-    level_array, curve_array = np.array(level), np.maximum(np.array(curve) / bias, _QUANTISATION)
-    ranked = np.argsort(level_array)
-    return NoiseModel(level_array[ranked], curve_array[ranked], correlation, floor, ceiling)
+    return NoiseModel(level_array, np.maximum(curve_array / bias, _QUANTISATION), correlation, floor, ceiling)
+
+
+def _smooth(level: Float, variance: Float) -> Float:
+    """Take from a variance curve (levels ascending) what rises too steeply to be noise: classes full of structure."""
+    out = variance.copy()
+    middle = int(np.argsort(variance)[(len(variance) - 1) // 2])
+    for step in (1, -1):
+        for k in range(middle + step, len(out) if step > 0 else -1, step):
+            ratio = (level[k] + 1) / (level[k - step] + 1) if level[k - step] > -1 else 1.0
+            out[k] = min(out[k], out[k - step] * STEEP * max(ratio, 1 / max(ratio, 1e-9)) ** POWER)
+    return out
 
 
 def _tiles(film: NDArray[Any], side: int) -> NDArray[Any]:

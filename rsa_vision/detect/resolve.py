@@ -141,7 +141,9 @@ def _taken(fits: BallFits, good: BallFits) -> Bool:
 def _like(fits: BallFits, known: BallFits) -> Bool:
     """Say which balls of a group are like those of the film that stand alone: two blobs can explain much that is none."""
     size = np.abs(np.log(fits.radius_px / np.median(known.radius_px))) < _LIKE
-    return np.asarray(size & (np.abs(fits.depth) > 0.4 * np.median(np.abs(known.depth))))
+    apart = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(size))
+    size &= apart.min(1, initial=99.0) > 0.4 * fits.radius_px  # two nearly in one place share its depth between them anyhow
+    return np.asarray(size & (np.sign(fits.depth) == np.sign(np.median(known.depth))) & (np.abs(fits.depth) > 0.4 * np.median(np.abs(known.depth))))
 
 
 def inside(fits: BallFits, film: NDArray[Any]) -> Bool:
@@ -192,7 +194,8 @@ def _unexplained_pairs(film: NDArray[Any], candidates: Candidates, good: BallFit
     peaks = peaks[_deep(film, peaks, typical) > 0.4 * np.median(np.abs(good.depth))]
     if len(peaks) == 0:
         return []
-    free = np.min(np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1)), axis=1) > 0.6 * typical
+    gaps = np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1))
+    free = (gaps > np.maximum(0.6 * typical, 0.9 * good.radius_px)).all(1)
     out = []
     used = np.zeros(len(peaks), bool)
     for i in np.nonzero(free)[0]:

@@ -1,0 +1,98 @@
+"""Balls: found, none invented, and as exact as stated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rsa_vision.detect import Detection, detect_markers
+from rsa_vision.flags import MarkerFlag
+from tests.detect.films import film_of_balls, grid_of_balls, stored
+
+BAND = (0.85, 1.15)  # observed / stated error; 200 coordinates determine it to 5 %
+BACKGROUND, DEPTH = 30000.0, 0.5
+
+
+def nearest(truth: NDArray[np.float64], found: Detection) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Index of the nearest found marker image, and its distance in pixels, for every true one."""
+    gap = np.hypot(*(truth[:, None] - found.images.position_px[None]).transpose(2, 0, 1))
+    return gap.argmin(1), gap.min(1)
+
+
+@pytest.mark.parametrize(("cnr", "noise_blur_px"), [(50, 0.0), (20, 0.0), (10, 0.0), (20, 1.2), (10, 1.2)])
+def test_every_ball_is_found_and_its_stated_error_is_true(cnr: float, noise_blur_px: float) -> None:
+    rng = np.random.default_rng(int(cnr))
+    truth, radius = grid_of_balls(rng, 10, 64.0, (2.5, 7.0))
+    film = film_of_balls(
+        (670, 670), truth, radius, background=BACKGROUND, depth=DEPTH, noise_sd=DEPTH * BACKGROUND / cnr, noise_blur_px=noise_blur_px, rng=rng
+    )
+    found = detect_markers(stored(film), bits=16)
+    index, gap = nearest(truth, found)
+    assert found.dark_markers
+    assert (gap < 1.0).all(), "a ball was missed"
+    assert len(found.images) == len(truth), "a ball was invented"
+    error = found.images.position_px[index] - truth
+    sd = np.sqrt(np.einsum("nii->ni", found.images.covariance_px2[index]))
+    ratio = float(np.sqrt(((error / sd) ** 2).mean()))
+    print(f"CNR {cnr}, noise blur {noise_blur_px}: RMS {np.sqrt((error**2).mean()):.4f} px, error / sd {ratio:.2f}")
+    assert BAND[0] < ratio < BAND[1]
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_polarity_does_not_matter(bits: int) -> None:
+    rng = np.random.default_rng(5)
+    full = 2**bits - 1
+    truth, radius = grid_of_balls(rng, 4, 64.0, (3.0, 6.0))
+    film = film_of_balls((290, 290), truth, radius, background=0.7 * full, depth=0.4, noise_sd=0.01 * full, rng=rng)
+    dark = detect_markers(stored(film, bits), bits=bits)
+    bright = detect_markers(stored(full - film, bits), bits=bits)
+    assert dark.dark_markers
+    assert not bright.dark_markers
+    assert len(dark.images) == len(bright.images) == 16
+    index, gap = nearest(dark.images.position_px, bright)
+    assert gap.max() < 0.1  # rounding goes the other way
+
+
+@pytest.mark.parametrize("distance", [2.6, 1.6, 1.0, 0.75, 0.5])
+def test_neighbours_are_resolved_or_flagged(distance: float) -> None:
+    """A pair at a distance in diameters, among others that tell the size: right within its statement, or flagged."""
+    rng = np.random.default_rng(9)
+    truth, _ = grid_of_balls(rng, 5, 70.0, (4.0, 4.0))
+    angle = rng.uniform(0, 2 * np.pi, 8)
+    beside = truth[:8] + 8.0 * distance * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    every = np.concatenate([truth, beside])
+    film = film_of_balls((390, 390), every, np.full(len(every), 4.0), background=BACKGROUND, depth=0.35, noise_sd=300.0, rng=rng)
+    found = detect_markers(stored(film), bits=16)
+    images = found.images
+    trusted = images.rows((images.flags & (MarkerFlag.OVERLAP | MarkerFlag.POOR_FIT)) == 0)
+    gap = np.hypot(*(trusted.position_px[:, None] - every[None]).transpose(2, 0, 1))
+    error = trusted.position_px - every[gap.argmin(1)]
+    sd = np.sqrt(np.einsum("nii->ni", trusted.covariance_px2))
+    assert (np.abs(error) / sd).max() < 5.0, "confident and wrong"
+    _, miss = nearest(every, found)
+    print(f"{distance} diameters: {np.count_nonzero(miss[:8] < 1) + np.count_nonzero(miss[25:] < 1)} of 16 in pairs found")
+    if distance >= 1.0:
+        assert (miss < 1.0).all()
+
+
+def test_saturated_cores_are_masked_and_flagged() -> None:
+    rng = np.random.default_rng(2)
+    truth, radius = grid_of_balls(rng, 5, 64.0, (5.0, 6.0))
+    film = film_of_balls((350, 350), truth, radius, background=180.0, depth=1.2, noise_sd=2.0, rng=rng)
+    found = detect_markers(stored(film, 8), bits=8)
+    index, gap = nearest(truth, found)
+    assert (gap < 0.5).all()
+    assert (found.images.flags[index] & MarkerFlag.SATURATED).all()
+
+
+def test_balls_over_the_edge_of_the_film_are_flagged() -> None:
+    rng = np.random.default_rng(3)
+    truth, radius = grid_of_balls(rng, 4, 64.0, (4.0, 5.0))
+    truth[0] = (2.0, 40.0)
+    film = film_of_balls((290, 290), truth, radius, background=BACKGROUND, depth=DEPTH, noise_sd=300.0, rng=rng)
+    found = detect_markers(stored(film), bits=16)
+    index, gap = nearest(truth, found)
+    assert (gap[1:] < 0.5).all()
+    if gap[0] < 2.0:
+        assert found.images.flags[index[0]] & MarkerFlag.EDGE
