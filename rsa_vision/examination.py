@@ -12,6 +12,7 @@ from rsa_vision.cages import Cage
 from rsa_vision.cameras import Camera
 from rsa_vision.detect import detect_markers
 from rsa_vision.errors import CalibrationError, RsaError
+from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.camera import camera_rays
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.cage import CageIdentification, identify_cage
@@ -22,6 +23,9 @@ from rsa_vision.settings import Study
 from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
 from rsa_vision.xray import rays_of, reconstruct, reconstruct_calibrated, solve_focus
+
+LOOKS_DOUBTFUL = int(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)
+"""Images whose size and contrast say little of their markers."""
 
 ExposedFilm = tuple[Film, int | None]
 """A film and the focus that it belongs to, None for all foci."""
@@ -190,6 +194,8 @@ def _pair(
     radius_mm, contrast = table.radius_px[bundle.image] * scale, table.contrast[bundle.image]
     if slant is not None:  # a ball seen at a slant is an ellipse, longer by 1 / cos: the fitted radius is the geometric mean
         radius_mm = radius_mm * np.sqrt(slant)
+    doubtful = (table.points.flags[bundle.image] & LOOKS_DOUBTFUL) != 0
+    radius_mm, contrast = np.where(doubtful, np.nan, radius_mm), np.where(doubtful, np.nan, contrast)
     return pair_rays(bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, slack_mm=slack_mm)
 
 

@@ -82,7 +82,7 @@ def on_bodies(scene: Scene, parameters: Float, images: FilmImages, rows: Int) ->
     with np.errstate(invalid="ignore"):
         wide = (images.shape == "ball") & (images.radius_mm > 1.35 * width[:, None])
     result = np.zeros(away.shape, bool)
-    result |= away < 1.2 * width[:, None] + BODY_MM
+    result |= away < 1.2 * width[:, None] + np.where(wide, 0.0, BODY_MM)
     for arm in range(scene.arms_mm.shape[1]):
         mine = np.isfinite(scene.arms_mm[rows, arm, 0])
         if mine.any():
