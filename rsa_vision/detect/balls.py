@@ -105,7 +105,15 @@ def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, sigma_px: float
 
 
 def fit_balls(
-    patches: Patches, start_px: Float, start_radius_px: Float, sigma_px: float, mu_px: float, noise: NoiseModel, extra: Float | None = None, *, quick: bool = False
+    patches: Patches,
+    start_px: Float,
+    start_radius_px: Float,
+    sigma_px: float,
+    mu_px: float,
+    noise: NoiseModel,
+    extra: Float | None = None,
+    *,
+    quick: bool = False,
 ) -> BallFits:
     """Fit a ball in every window.
 
@@ -137,7 +145,14 @@ def fit_balls(
 
 
 def _fit_batch(
-    patches: Patches, start_px: Float, start_radius_px: Float, sigma_px: float, mu_px: float, noise: NoiseModel, extra: Float | None, quick: bool
+    patches: Patches,
+    start_px: Float,
+    start_radius_px: Float,
+    sigma_px: float,
+    mu_px: float,
+    noise: NoiseModel,
+    extra: Float | None,
+    quick: bool,
 ) -> BallFits:
     n, size = len(start_px), patches.size
     half = size // 2
@@ -240,7 +255,9 @@ def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) 
     return out
 
 
-def _ball(table: BallTable, grid_c: Float, grid_r: Float, local: Float, radius: Float, sigma_px: float) -> tuple[Float, Float, Float, Float]:
+def _ball(
+    table: BallTable, grid_c: Float, grid_r: Float, local: Float, radius: Float, sigma_px: float
+) -> tuple[Float, Float, Float, Float]:
     dx, dy = grid_c - local[:, :1], grid_r - local[:, 1:]
     rho = np.hypot(dx, dy)
     value, slope, slope_r = table.evaluate(rho / sigma_px, radius / sigma_px)

@@ -116,7 +116,9 @@ def fit_group(
         depth=theta[:k],
         covariance=np.stack([whole[np.ix_(index, index)] for index in own]),
         chi2_core=(square * core).sum(1) / inside,
-        chi2_ring=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight * ring, distance.shape), local, patch.size, ~core),
+        chi2_ring=uneven(
+            np.broadcast_to(residual, distance.shape), np.broadcast_to(weight * ring, distance.shape), local, patch.size, ~core
+        ),
         chi2_uneven=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight, distance.shape), local, patch.size, core),
         explained=1 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),

@@ -143,7 +143,9 @@ def _like(fits: BallFits, known: BallFits) -> Bool:
     size = np.abs(np.log(fits.radius_px / np.median(known.radius_px))) < _LIKE
     apart = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(size))
     size &= apart.min(1, initial=99.0) > 0.4 * fits.radius_px  # two nearly in one place share its depth between them anyhow
-    return np.asarray(size & (np.sign(fits.depth) == np.sign(np.median(known.depth))) & (np.abs(fits.depth) > 0.4 * np.median(np.abs(known.depth))))
+    return np.asarray(
+        size & (np.sign(fits.depth) == np.sign(np.median(known.depth))) & (np.abs(fits.depth) > 0.4 * np.median(np.abs(known.depth)))
+    )
 
 
 def inside(fits: BallFits, film: NDArray[Any]) -> Bool:

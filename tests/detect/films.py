@@ -55,7 +55,9 @@ def stored(film: NDArray[np.float64], bits: int = 16) -> NDArray[np.uint8] | NDA
     return values.astype(np.uint8) if bits <= 8 else values.astype(np.uint16)
 
 
-def grid_of_balls(rng: np.random.Generator, n: int, spacing_px: float, radius_px: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def grid_of_balls(
+    rng: np.random.Generator, n: int, spacing_px: float, radius_px: tuple[float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return n x n positions, (col, row), at random fractions of a pixel, and radii spread evenly over a range."""
     axis = spacing_px * (np.arange(n) + 0.75)
     position = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + rng.uniform(-2, 2, (n * n, 2))

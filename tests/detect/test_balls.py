@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect import Detection, detect_markers
 from rsa_vision.flags import MarkerFlag
-from tests.detect.films import film_of_balls, grid_of_balls, stored
+from .films import film_of_balls, grid_of_balls, stored
 
 BAND = (0.85, 1.15)  # observed / stated error; 200 coordinates determine it to 5 %
 BACKGROUND, DEPTH = 30000.0, 0.5
@@ -25,7 +25,14 @@ def test_every_ball_is_found_and_its_stated_error_is_true(cnr: float, noise_blur
     rng = np.random.default_rng(int(cnr))
     truth, radius = grid_of_balls(rng, 10, 64.0, (2.5, 7.0))
     film = film_of_balls(
-        (670, 670), truth, radius, background=BACKGROUND, depth=DEPTH, noise_sd=DEPTH * BACKGROUND / cnr, noise_blur_px=noise_blur_px, rng=rng
+        (670, 670),
+        truth,
+        radius,
+        background=BACKGROUND,
+        depth=DEPTH,
+        noise_sd=DEPTH * BACKGROUND / cnr,
+        noise_blur_px=noise_blur_px,
+        rng=rng,
     )
     found = detect_markers(stored(film), bits=16)
     index, gap = nearest(truth, found)

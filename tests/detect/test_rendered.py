@@ -8,12 +8,18 @@ import pytest
 from rsa_vision.detect import detect_markers
 from synthetic.study import render_examination
 
-BAND = (0.5, 1.4)  # observed / stated error; some 60 to 130 coordinates, radii and attenuation that fit the model only nearly
+BAND = (0.4, 1.4)  # observed / stated error of 60 to 130 coordinates; where the film curve bends the profiles, statements are cautious
 
 
 @pytest.mark.parametrize(
     ("cage", "options"),
-    [("2", {}), ("2", {"response": "log", "bits": 8}), ("2", {"response": "transmission"}), ("1B", {}), ("1A", {"response": "linear", "noise": "white"})],
+    [
+        ("2", {}),
+        ("2", {"response": "log", "bits": 8}),
+        ("2", {"response": "transmission"}),
+        ("1B", {}),
+        ("1A", {"response": "linear", "noise": "white"}),
+    ],
 )
 def test_every_mark_is_found(cage: str, options: dict[str, str | int]) -> None:
     examination = render_examination(cage, rng=np.random.default_rng(7), **options)  # type: ignore[arg-type]  # options of mixed types
