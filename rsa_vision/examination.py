@@ -145,7 +145,7 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
     centre = named.points.position_px.mean(axis=0)
     scale = {focus: local_scale(fit.plane_from_film, centre) for focus, fit in fits.items()}
     region = cage_region(cage, {focus: fit.position_mm for focus, fit in fits.items()})
-    normals = np.array([cage.plane_of(int(focus)).normal() for focus in bundle.focus])
+    normals = np.array([cage.plane_of(int(focus)).normal() for focus in bundle.focus]).reshape(-1, 3)
     slant = np.abs(np.einsum("ij,ij->i", bundle.direction, normals))
     pairing = _pair(table, bundle, scale, study, region, slant=slant)
     complete = name_objects(named, table, bundle, pairing, foreign)

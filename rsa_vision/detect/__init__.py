@@ -29,7 +29,7 @@ from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import estimate_optics
 from rsa_vision.detect.resolve import resolve_balls
-from rsa_vision.detect.tees import find_tees, is_tee
+from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
@@ -37,6 +37,7 @@ __all__ = ["Detection", "detect_markers"]
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
+_LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +95,8 @@ def _polarities(film: NDArray[Any], seeds: BallFits, candidates: Candidates, noi
     for sign in (-1, 1):
         optics[sign], balls = estimate_optics(film, seeds.rows(np.sign(seeds.depth) == sign), noise)
         strength = -sign * candidates.junctions[:, 4]
+        if balls < _LEAST_EVIDENCE and (strength > CLEAR_JUNCTION).any():
+            optics[sign] = optics_of_tees(film, candidates.junctions[strength > CLEAR_JUNCTION], noise)
         weight[sign] = balls + float(np.clip(strength - CLEAR_JUNCTION, 0.0, 20.0).sum())
     best = max(weight, key=lambda sign: weight[sign])
     if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.crossing import fit_crossing
-from rsa_vision.detect.find import EXPLAINED, MISFIT, Optics, refine
+from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, Optics, refine
 from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles, needle_image, thick_ends
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.templates import find_like
@@ -25,6 +25,7 @@ _MOST_TOGETHER = 4  # tees in one fit; larger sets are cut where they overlap le
 _NEAREST_PX = 3.0  # two tips nearer than this are one
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
+_BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
 _ATTENUATIONS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.2)  # of the arms, relative to the balls
 
@@ -71,6 +72,29 @@ def find_tees(
     # with the directions held, the slanted thick ends can no longer turn the arms: they may lend their weight
     tees = _fit_all(film, tees, optics, noise, ends=offsets is not None)
     return [_with_error(t, error) for t in tees if is_tee(t)], [t for t in tees if not is_tee(t) and is_tee(t, slack=ROUGH)], optics
+
+
+def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> Optics:
+    """Estimate the blur from the strongest junctions, for films without balls.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    junctions : ndarray of shape (n, 5)
+    noise : NoiseModel
+
+    Returns
+    -------
+    Optics
+    """
+    strongest = junctions[np.argsort(-np.abs(junctions[:, 4]))][:ENOUGH]
+
+    def left(sigma_px: float) -> float:
+        return _mean_misfit(_at_junctions(film, strongest, TAPERS[0], Optics(sigma_px, COARSE_MU_PX), noise))
+
+    costs = {sigma: left(sigma) for sigma in _BLURS_PX}
+    best = min(costs, key=lambda sigma: costs[sigma])
+    return Optics(best if np.isfinite(costs[best]) else COARSE_SIGMA_PX, COARSE_MU_PX)
 
 
 def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
