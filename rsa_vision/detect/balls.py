@@ -272,4 +272,5 @@ def _solve(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> F
     scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
     normal = normal / (scale[:, :, None] * scale[:, None, :])
     normal[:, np.arange(jac.shape[2]), np.arange(jac.shape[2])] += damping
-    return np.linalg.solve(normal, (right / scale)[:, :, None])[:, :, 0] / scale
+    solution: Float = np.linalg.solve(normal, (right / scale)[:, :, None])[:, :, 0] / scale
+    return solution

@@ -88,7 +88,7 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
     if any(pad):
         band = cv2.copyMakeBorder(band, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
     level_images: dict[int, NDArray[Any]] = {}
-    image = cv2.resize(band, (band.shape[1] // 2, band.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+    image: NDArray[Any] = cv2.resize(band, (band.shape[1] // 2, band.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
     for level in (1, 2, 3):
         level_images[level] = image
         image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
@@ -98,7 +98,11 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
         source = level_images[level]
         # outer minus inner: positive where the mark is darker than its surroundings
         answer = cv2.GaussianBlur(source, (0, 0), outer) - cv2.GaussianBlur(source, (0, 0), inner)
-        limit = threshold * cv2.resize(_local_spread(answer, _white_spread(noise, level, inner, outer)), (answer.shape[1], answer.shape[0]), interpolation=cv2.INTER_LINEAR)
+        limit = threshold * cv2.resize(
+            _local_spread(answer, _white_spread(noise, level, inner, outer)),
+            (answer.shape[1], answer.shape[0]),
+            interpolation=cv2.INTER_LINEAR,
+        )
         out.append(_extrema(answer, limit, level, radius, threshold))
         if (level, radius) == JUNCTION_SCALE:
             junctions = find_junctions(answer, limit, level)
@@ -142,4 +146,5 @@ def _local_spread(answer: NDArray[Any], least: float) -> NDArray[Any]:
     # every third pixel in either direction: the filter's own correlation makes the others nearly copies
     part = np.abs(answer[: n_rows * block_r, : n_cols * block_c].reshape(n_rows, block_r, n_cols, block_c)[:, 1::3, :, 1::3])
     middle = np.median(part.swapaxes(1, 2).reshape(n_rows, n_cols, -1), axis=2) / 0.6745
-    return np.maximum(middle, least).astype(np.float32)
+    spread: NDArray[Any] = np.maximum(middle, least).astype(np.float32)
+    return spread

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from rsa_vision.detect.balls import BallFits, fit_balls, half_size, join
-from rsa_vision.detect.candidates import Candidates, find_candidates
+from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import cut
 from rsa_vision.types import Bool, Float
@@ -77,18 +77,21 @@ def fit_at(
 def misfit(fits: BallFits, noise: NoiseModel) -> Float:
     """Return the RMS residual under the ball beyond the noise, as a fraction of the depth, shape (n,)."""
     excess = np.maximum(fits.chi2_core - 1.0, 0.0) * noise.variance_at(fits.background)
-    return np.sqrt(excess) / np.maximum(np.abs(fits.depth), 1e-9)
+    rest: Float = np.sqrt(excess) / np.maximum(np.abs(fits.depth), 1e-9)
+    return rest
 
 
 def significance(fits: BallFits) -> Float:
     """Return depth over its standard deviation at the fitted centre and radius, shape (n,).
 
-    Radius and depth of a ball that is small against the blur can stand for each other, so that neither is sure alone: that something is there is.
+    Radius and depth of a ball that is small against the blur can stand for each other, so that neither is sure alone: that something is there
+    is.
     """
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", fits.covariance), 1e-30))
     correlation = fits.covariance / (scale[:, :, None] * scale[:, None, :])
     precision = np.linalg.pinv(correlation, hermitian=True)[:, 3, 3] / scale[:, 3] ** 2
-    return np.abs(fits.depth) * np.sqrt(np.maximum(precision, 0.0))
+    out: Float = np.abs(fits.depth) * np.sqrt(np.maximum(precision, 0.0))
+    return out
 
 
 def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:

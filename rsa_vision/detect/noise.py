@@ -80,8 +80,8 @@ def saturation(film: NDArray[Any], bits: int) -> tuple[float, float]:
 
 
 def _piles_up(sample: NDArray[Any], edge: int, inward: int) -> bool:
-    neighbours = [np.count_nonzero(sample == edge + inward * k) for k in range(1, 6)]
-    return np.count_nonzero(sample == edge) > 5 * max(1, max(neighbours))
+    neighbours = [int(np.count_nonzero(sample == edge + inward * k)) for k in range(1, 6)]
+    return bool(np.count_nonzero(sample == edge) > 5 * max(1, *neighbours))
 
 
 def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:

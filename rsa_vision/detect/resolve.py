@@ -142,7 +142,7 @@ def _like(fits: BallFits, known: BallFits) -> Bool:
     """Say which balls of a group are like those of the film that stand alone: two blobs can explain much that is none."""
     size = np.abs(np.log(fits.radius_px / np.median(known.radius_px))) < _LIKE
     apart = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(size))
-    size &= apart.min(1, initial=99.0) > 0.4 * fits.radius_px  # two nearly in one place share its depth between them anyhow
+    size = size & (apart.min(1, initial=99.0) > 0.4 * fits.radius_px)  # two nearly in one place share its depth between them anyhow
     return np.asarray(
         size & (np.sign(fits.depth) == np.sign(np.median(known.depth))) & (np.abs(fits.depth) > 0.4 * np.median(np.abs(known.depth)))
     )

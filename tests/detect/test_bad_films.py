@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
+
 from .films import stored
 
 RNG = np.random.default_rng(1)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect import Detection, detect_markers
 from rsa_vision.flags import MarkerFlag
+
 from .films import film_of_balls, grid_of_balls, stored
 
 BAND = (0.85, 1.15)  # observed / stated error; 200 coordinates determine it to 5 %
@@ -57,7 +58,7 @@ def test_polarity_does_not_matter(bits: int) -> None:
     assert dark.dark_markers
     assert not bright.dark_markers
     assert len(dark.images) == len(bright.images) == 16
-    index, gap = nearest(dark.images.position_px, bright)
+    _, gap = nearest(dark.images.position_px, bright)
     assert gap.max() < 0.1  # rounding goes the other way
 
 
