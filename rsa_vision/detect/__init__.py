@@ -37,6 +37,7 @@ __all__ = ["Detection", "detect_markers"]
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
+_SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 
 
@@ -190,6 +191,8 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     poor = np.concatenate([misfit(balls, noise), [t.misfit for t in tees]]) > 0.6 * MISFIT
     poor[:n] |= balls.chi2_ring > EDGE
     flags[poor] |= MarkerFlag.POOR_FIT
+    # what the model does not describe may be two marks in one: its centre is only somewhere in it
+    covariance[poor] += (_SOMEWHERE * radius[poor] ** 2)[:, None, None] * np.eye(2)
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))

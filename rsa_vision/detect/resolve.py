@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls import BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.find import Optics, distinct, fit_at, plausible
+from rsa_vision.detect.find import MISFIT, Optics, distinct, fit_at, misfit, plausible
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float, Int
@@ -24,6 +24,7 @@ Background = Callable[[Float, Float], Float]
 
 TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the fit of the other
 _MOST_IN_GROUP = 5
+DOUBTFUL = 0.6  # of the misfit that a ball may leave: more may be two balls
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
@@ -61,16 +62,11 @@ def resolve_balls(
     for members in _unexplained_pairs(film, candidates, good, optics):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, good)))
-    sure = good.rows(plausible(good, noise))
+    clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
+    sure = single.rows(clean)
     nobody = np.arange(0)
-    pairs = split_blobs(
-        film,
-        single.rows(~plausible(single, noise) & ~_taken(single, sure)),
-        sure,
-        optics,
-        noise,
-        lambda: _beside(sure, nobody, optics, tees),
-    )
+    blobs = single.rows(~clean & ~_taken(single, sure))
+    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: _beside(sure, nobody, optics, tees))
     fits += pairs
     if pairs:  # a blob that two balls explain is no ball
         good = good.rows(~_taken(good, join(pairs)))

@@ -25,6 +25,8 @@ SHEAR_SD: Final = 0.010  # half the anisotropy and shear of a scanner, up to 2 %
 GAP_MM: Final = 12.0  # film to plane: 0..40 mm; a wide prior around Selvik's 8 and 10 mm
 GAP_SD_MM: Final = 12.0
 TILT_SD: Final = 0.02  # of the film to the plane, rad
+USUAL: Final = 0.8  # part of all set-ups whose foci lie within a few centimetres of their nominal places
+USUAL_SD_MM: Final = 25.0
 FOCUS_SD_MM: Final = 100.0  # of each coordinate about the nominal focus; the limit is 150 mm
 
 
@@ -275,7 +277,17 @@ def fit(scene: Scene, start: Float, rows: Int, observed_mm: Float, covariance_mm
     if sign <= 0:
         raise np.linalg.LinAlgError("not a minimum")
     log_prior = -0.5 * float(prior @ prior) - float(normalisers) - 0.5 * float(log_determinant) + 1.5 * np.log(2 * np.pi) - np.log(4)
+    log_prior += _usual_foci(scene, parameters)
     return Fit(parameters, np.asarray(np.linalg.inv(hessian), float), observed_mm - predicted, slopes, float(log_prior))
+
+
+def _usual_foci(scene: Scene, parameters: Float) -> float:
+    """Log of how much likelier foci so near to their nominal places are than the wide prior has it: most set-ups repeat within centimetres."""
+    square = ((parameters[FILM:].reshape(-1, 3) - scene.nominal_mm) ** 2).sum(axis=1)
+    near = np.log(USUAL) - 1.5 * np.log(2 * np.pi * USUAL_SD_MM**2) - square / (2 * USUAL_SD_MM**2)
+    far = np.log(1 - USUAL) - 1.5 * np.log(2 * np.pi * FOCUS_SD_MM**2) - square / (2 * FOCUS_SD_MM**2)
+    wide = -1.5 * np.log(2 * np.pi * FOCUS_SD_MM**2) - square / (2 * FOCUS_SD_MM**2)
+    return float((np.logaddexp(near, far) - wide).sum())
 
 
 def plane_from_film(scene: Scene, parameters: Float, focus: int) -> Float:
