@@ -13,7 +13,8 @@ from rsa_vision.types import Float
 
 TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surface, large enough to hold correlated noise
 ENOUGH_TILES = 12  # that are nowhere saturated
-STEEP, POWER = 1.15, 6.0  # variance grows at most by this from class to class, and with this power of the value
+MARKS = 1.8  # times as much as that, and it is not even noise and texture
+STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, and with this power of the value
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
 _LEVELS = 12  # value classes of the variance curve
@@ -140,8 +141,11 @@ def _smooth(level: Float, variance: Float) -> Float:
     for step in (1, -1):
         for k in range(middle + step, len(out) if step > 0 else -1, step):
             ratio = (level[k] + 1) / (level[k - step] + 1) if level[k - step] > -1 else 1.0
-            if out[k] > out[k - step] * STEEP * max(ratio, 1 / max(ratio, 1e-9)) ** POWER:
-                out[k] = out[k - step]  # nothing is known of the noise there but what it is beside
+            most = out[k - step] * STEEP * max(ratio, 1 / max(ratio, 1e-9)) ** POWER
+            if out[k] > MARKS * most:
+                out[k] = out[k - step]  # a class of marks: nothing is known of its noise but what is beside it
+            else:
+                out[k] = min(out[k], most)
     return out
 
 
