@@ -1,6 +1,7 @@
 """Marker images of one film: tantalum balls, pointed pins and tees, without knowing the cage.
 
-Nothing about the film is taken for granted: polarity, blur, attenuation (with it the bend of the film curve) and noise are estimated from it.
+Nothing about the film is taken for granted: polarity, blur, attenuation (with it the bend of the film curve) and noise are
+estimated from it.
 """
 
 from __future__ import annotations
@@ -20,8 +21,6 @@ from rsa_vision.detect.find import (
     Optics,
     first_look,
     misfit,
-    plausible,
-    significance,
     significance_limit,
 )
 from rsa_vision.detect.mixed import part
@@ -71,8 +70,8 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     bits : int
         Significant bits.
     response : str
-        ``auto``, ``density``, ``transmission``, ``linear`` or ``log``. The model takes the bend of the response from the film (it shows in the
-        profiles as more or less attenuation), so this is a statement about the film, not a switch; it is kept for ``run.json``.
+        ``auto``, ``density``, ``transmission``, ``linear`` or ``log``. The model takes the bend of the response from the film (it shows in
+        the profiles as more or less attenuation), so this is a statement about the film, not a switch; it is kept for ``run.json``.
     false_detections : float
         Expected number of marker images on a film that are noise alone.
 

@@ -1,4 +1,4 @@
-"""Two balls that melt into one blob: told from one ball by what one ball cannot explain, started from the blob's own length and direction."""
+"""Two balls melted into one blob: told from one ball by what that cannot explain, started from the blob's length and direction."""
 
 from __future__ import annotations
 
@@ -94,4 +94,5 @@ def _long_axis(film: NDArray[Any], blob: BallFits, sign: float) -> Float:
     moments = np.array([[(over * dx * dx).sum(), (over * dx * dy).sum()], [(over * dx * dy).sum(), (over * dy * dy).sum()]]) / total
     small, large = np.linalg.eigvalsh(moments)
     direction: Float = np.linalg.eigh(moments)[1][:, 1]
-    return 2.0 * np.sqrt(max(large - small, 0.04)) * direction
+    between: Float = 2.0 * np.sqrt(max(large - small, 0.04)) * direction
+    return between

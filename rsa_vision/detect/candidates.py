@@ -1,7 +1,7 @@
 """Where marker images may be: a cheap multi-scale filter over the film in bands, recall first.
 
-Differences of Gaussians on a pyramid that starts at half resolution, in units of the local spread of the same filter (so that trabeculae raise the
-threshold where they are, and nowhere else). Both polarities come out of one pass.
+Differences of Gaussians on a pyramid that starts at half resolution, in units of the local spread of the same filter (so that
+trabeculae raise the threshold where they are, and nowhere else). Both polarities come out of one pass.
 """
 
 from __future__ import annotations

@@ -84,8 +84,8 @@ def misfit(fits: BallFits, noise: NoiseModel) -> Float:
 def significance(fits: BallFits) -> Float:
     """Return depth over its standard deviation at the fitted centre and radius, shape (n,).
 
-    Radius and depth of a ball that is small against the blur can stand for each other, so that neither is sure alone: that something is there
-    is.
+    Radius and depth of a ball that is small against the blur can stand for each other, so that neither is sure alone: that something is
+    there     is.
     """
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", fits.covariance), 1e-30))
     correlation = fits.covariance / (scale[:, :, None] * scale[:, None, :])
@@ -177,7 +177,10 @@ def significance_limit(film_size: int, radius_px: float, false_detections: float
     float
     """
     places = film_size / (np.pi * radius_px**2) * 4  # four filters
-    return float(-ndtri(min(0.5, false_detections / places)))
+    limit = 3.0
+    for _ in range(20):  # a fit goes to the highest point around: maxima of a random field are 0.44 u^2 as many as the tail alone has it
+        limit = float(-ndtri(min(0.5, false_detections / (places * max(1.0, 0.44 * limit**2)))))
+    return limit
 
 
 def _no_fits() -> BallFits:

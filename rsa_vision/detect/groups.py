@@ -132,8 +132,8 @@ def fit_group(
 def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
     """Return functions that together make any smooth profile across the strongest edge of a window.
 
-    The edge of a bone or an implant is straight over the width of a ball: it changes across, not along. A ball changes both ways, so its centre
-    stays determined, if less well across the edge; the covariance knows.
+    The edge of a bone or an implant is straight over the width of a ball: it changes across, not along. A ball changes both ways, so its
+    centre     stays determined, if less well across the edge; the covariance knows.
 
     Parameters
     ----------

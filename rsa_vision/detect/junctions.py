@@ -1,7 +1,7 @@
 """Where tees and single pins may be: what the filter's answer looks like on rings around a point.
 
-Around the common tip of a tee a ring meets three arms, 90 degrees apart, and nothing else; around the tip of a pin it meets one. The rings are
-sampled only where the filter answers at all.
+Around the common tip of a tee a ring meets three arms, 90 degrees apart, and nothing else; around the tip of a pin it meets one. The rings
+are sampled only where the filter answers at all.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fits of pointed pins and of tees (three pins whose tips meet): a blurred cone seen from the side, or three of them with one common tip.
 
-The tip of a tapering pin fades out: the opacity near it grows with the square of the distance, so any threshold lies pixels away from it. The
-model is the opacity along the chord through a cone, blurred; the tip is a parameter of it.
+The tip of a tapering pin fades out: the opacity near it grows with the square of the distance, so any threshold lies pixels away from it.
+The model is the opacity along the chord through a cone, blurred; the tip is a parameter of it.
 """
 
 from __future__ import annotations
@@ -153,9 +153,7 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, sigma_px: float, mu_px: f
     return image
 
 
-def arm_images(
-    dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float, mu: float
-) -> Float:
+def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float, mu: float) -> Float:
     """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the first axis."""
     # tables stand on a grid of shapes, shared by all needles of a film; in between the image is linear in the shape
     off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % GRID_L
@@ -186,7 +184,9 @@ def beyond_ends(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: 
     out = np.zeros(dx.shape, bool)
     for angle in angles:
         c, s = np.cos(angle), -np.sin(angle)
-        out |= (dx * c + dy * s > shape.length_px - _end_reach(shape, sigma)) & (np.abs(-dx * s + dy * c) < 2 * shape.half_width_px + 3 * sigma)
+        out |= (dx * c + dy * s > shape.length_px - _end_reach(shape, sigma)) & (
+            np.abs(-dx * s + dy * c) < 2 * shape.half_width_px + 3 * sigma
+        )
     return out
 
 
@@ -238,8 +238,8 @@ def fit_needles(
         The thick ends take part and the length is free. Seen from the focus at a slant the flat end of a pin is a tilted ellipse, which the
         model does not have: it would turn the arms and so move the tip. So the last fit leaves the ends out and holds the length.
     rigid : bool
-        The arms turn together; else each has its own direction. With ``ends`` they are equally deep, too: for a first look, while neighbours
-        still disturb.
+        The arms turn together; else each has its own direction. With ``ends`` they are equally deep, too: for a first look, while
+        neighbours         still disturb.
     quick : bool
         While others still move: fewer steps, and a covariance as if the noise were white.
 
@@ -302,7 +302,9 @@ def fit_needles(
     weighted = jac * weight[:, None]
     covariance = np.linalg.pinv(weighted.T @ jac, hermitian=True)
     influence = np.zeros((2, patch.size, patch.size))
-    influence[:, (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)] = covariance[:2] @ (weighted / np.sqrt(weight)[:, None]).T
+    influence[:, (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)] = (
+        covariance[:2] @ (weighted / np.sqrt(weight)[:, None]).T
+    )
     depth = float(depths.mean())
     image = depths @ value
     core = image / depth > 0.08 * max((image / depth).max(), 1e-9) if depth else np.zeros(len(image), bool)
@@ -352,4 +354,6 @@ def core_pixels(tip: Float, angles: Float, shape: NeedleShape, sigma: float, end
 
 def _unfit(tip: Float, angles: Float, shape: NeedleShape) -> NeedleFit:
     nan = float("nan")
-    return NeedleFit(tip, angles, shape, np.zeros(len(angles)), 0.0, nan, np.full((2, 2), nan), 0, np.inf, np.inf, 0.0, 0.0, np.inf, 0.0, False)
+    return NeedleFit(
+        tip, angles, shape, np.zeros(len(angles)), 0.0, nan, np.full((2, 2), nan), 0, np.inf, np.inf, 0.0, 0.0, np.inf, 0.0, False
+    )

@@ -200,8 +200,8 @@ def _smooth_correlation(auto: Float) -> tuple[Float, float]:
 def influence_covariance(influence: Float, correlation: Float) -> Float:
     """Return the covariance of linear functions of correlated noise.
 
-    A weighted least-squares fit stays unbiased when the noise of neighbouring pixels is correlated, but its variance is no longer the inverse
-    of the normal matrix; this is the "sandwich" for it.
+    A weighted least-squares fit stays unbiased when the noise of neighbouring pixels is correlated, but its variance is no longer the
+    inverse     of the normal matrix; this is the "sandwich" for it.
 
     Parameters
     ----------

@@ -168,16 +168,16 @@ def _beside(known: BallFits, members: Int, optics: Optics, tees: Background | No
 def _images(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
     """Images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
     total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
-    doubtful = np.zeros(cols.shape, bool)
+    doubtful: Bool = np.zeros(cols.shape, np.bool_)
     reach = known.radius_px + 4 * optics.sigma_px
     low, high = np.array([cols.min(), rows.min()]), np.array([cols.max(), rows.max()])
-    near = ((known.position_px > low - reach[:, None]) & (known.position_px < high + reach[:, None])).all(1)
+    near = np.array(((known.position_px > low - reach[:, None]) & (known.position_px < high + reach[:, None])).all(1))
     near[members] = False
     for j in np.nonzero(near)[0]:
         dx, dy = cols - known.position_px[j, 0], rows - known.position_px[j, 1]
         image = ball_image(dx.reshape(1, -1), dy.reshape(1, -1), known.radius_px[[j]], optics.sigma_px, optics.mu_px)
         total = total + known.depth[j] * image.reshape(cols.shape)
-        doubtful |= np.hypot(dx, dy) < known.radius_px[j] + optics.sigma_px
+        doubtful = doubtful | (np.hypot(dx, dy) < known.radius_px[j] + optics.sigma_px)
     return total, doubtful
 
 

@@ -30,9 +30,7 @@ CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other 
 _ATTENUATIONS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.2)  # of the arms, relative to the balls
 
 
-def find_tees(
-    film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel
-) -> tuple[list[NeedleFit], list[NeedleFit], Optics]:
+def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], list[NeedleFit], Optics]:
     """Find and fit all tees of one polarity.
 
     Parameters

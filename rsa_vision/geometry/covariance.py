@@ -134,9 +134,7 @@ def resection_errors(
     parameter = np.einsum("aikp,kpq->aiq", by_plane, by_parameter)
     image = np.einsum("aikp,kpq->aikq", by_plane, by_point).reshape(1 + n, 3, 2 * n)
     mark = stacked[..., 3:].reshape(1 + n, 3, 3 * n)
-    return ResectionErrors(
-        parameter[0], image[0], mark[0], *(part[1:].reshape(3 * n, -1) for part in (parameter, image, mark))
-    )
+    return ResectionErrors(parameter[0], image[0], mark[0], *(part[1:].reshape(3 * n, -1) for part in (parameter, image, mark)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

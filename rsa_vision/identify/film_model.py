@@ -282,7 +282,7 @@ def fit(scene: Scene, start: Float, rows: Int, observed_mm: Float, covariance_mm
 
 
 def _usual_foci(scene: Scene, parameters: Float) -> float:
-    """Log of how much likelier foci so near to their nominal places are than the wide prior has it: most set-ups repeat within centimetres."""
+    """Log of how much likelier foci so near to nominal are than the wide prior has it: most set-ups repeat within centimetres."""
     square = ((parameters[FILM:].reshape(-1, 3) - scene.nominal_mm) ** 2).sum(axis=1)
     near = np.log(USUAL) - 1.5 * np.log(2 * np.pi * USUAL_SD_MM**2) - square / (2 * USUAL_SD_MM**2)
     far = np.log(1 - USUAL) - 1.5 * np.log(2 * np.pi * FOCUS_SD_MM**2) - square / (2 * FOCUS_SD_MM**2)

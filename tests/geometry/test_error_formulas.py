@@ -34,17 +34,13 @@ def test_end_of_the_rod() -> None:
 HEIGHT = 80.0  # between the planes of the test object
 
 
-@pytest.mark.parametrize(
-    ("z_focus", "focus_sd", "expected"), [(1120, (116, 22, 620), (8, 1.6, 44)), (1000, (98, 49, 218), (8, 4, 17))]
-)
+@pytest.mark.parametrize(("z_focus", "focus_sd", "expected"), [(1120, (116, 22, 620), (8, 1.6, 44)), (1000, (98, 49, 218), (8, 4, 17))])
 def test_table_11(z_focus: float, focus_sd: tuple[float, ...], expected: tuple[float, ...]) -> None:
     found = common_shift_effect(np.array(focus_sd, float), z_focus_mm=z_focus, z_mm=HEIGHT)
     np.testing.assert_allclose(found, expected, atol=PRINTED)
 
 
-@pytest.mark.parametrize(
-    ("z_focus", "base", "focus_sd_x", "expected"), [(1120, 480, 116, (8, 3.5, 36)), (1000, 660, 98, (8, 2.4, 22))]
-)
+@pytest.mark.parametrize(("z_focus", "base", "focus_sd_x", "expected"), [(1120, 480, 116, (8, 3.5, 36)), (1000, 660, 98, (8, 2.4, 22))])
 def test_table_12(z_focus: float, base: float, focus_sd_x: float, expected: tuple[float, ...]) -> None:
     found = base_effect(2 * focus_sd_x, b_mm=base, z_focus_mm=z_focus, z_mm=HEIGHT, h_mm=z_focus - HEIGHT, y_mm=100)
     np.testing.assert_allclose(found, expected, atol=PRINTED)

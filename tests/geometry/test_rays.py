@@ -150,5 +150,3 @@ def test_control_point_in_the_plane_is_said() -> None:
     through = np.array([[0.0, 0, 0], [10, 0, 0]])
     with pytest.raises(GeometryError, match="no direction"):
         locate_focus(through, through * [1, 1, 0])
-
-

@@ -139,9 +139,7 @@ def test_three_foci() -> None:
     assert worst_mm(two, objects) < EXACT_MM
     gain = np.diagonal(two.markers.covariance_mm2, axis1=1, axis2=2) / np.diagonal(three.markers.covariance_mm2, axis1=1, axis2=2)
     assert (gain[3, :2] > 1.05).all()
-    ratios = [
-        reconstruct(disturbed(points, 0.1, rng), cage, LIMITS).markers.crossing_um / three.markers.crossing_sd_um for _ in range(60)
-    ]
+    ratios = [reconstruct(disturbed(points, 0.1, rng), cage, LIMITS).markers.crossing_um / three.markers.crossing_sd_um for _ in range(60)]
     assert 0.9 < np.sqrt(np.mean(np.square(ratios))) < 1.1  # twice the RMS distance of rays, against its expectation
 
 
