@@ -22,8 +22,8 @@ lint: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html
 
-bench: $(STAMP)  ## long: accuracy against the physical limit and against rivals
-	$(BIN)/python benchmarks/detection.py
+bench: $(STAMP)  ## long: rendered films measured and compared with the truth
+	$(BIN)/python benchmarks/reach.py
 
 lock:  ## renew requirements.lock (hashes, no addresses)
 	$(PYTHON) -m venv $(VENV)-lock
