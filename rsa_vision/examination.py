@@ -170,7 +170,9 @@ def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) 
         scale[focus] = float(np.linalg.norm(camera.translation) / camera.matrix[0, 0])
     bundle = joined_rays(bundles)
     slack_mm = study.limits.calibration_px * float(np.sqrt(2) * np.mean(list(scale.values())))
-    pairing = _pair(table, bundle, scale, study, None, slack_mm)
+    # exact calibrations pair best by their small errors; where those leave partners apart, the calibration has errors of its own
+    exact, tolerant = _pair(table, bundle, scale, study, None), _pair(table, bundle, scale, study, None, slack_mm)
+    pairing = exact if len(exact.groups) >= len(tolerant.groups) else tolerant
     nothing = table.with_points(table.points.rows(~everything), table.rows[:0])
     complete = name_objects(nothing, table, bundle, pairing, ~everything)
     findings = _pair_findings(pairing, study) + lonely_images(table, pairing, bundle)
