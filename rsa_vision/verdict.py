@@ -148,5 +148,6 @@ def _judge_markers(markers: Markers, limits: Limits) -> list[Finding]:
     if len(one_view):
         findings.append(("marker-one-view", f"seen from one focus only: {', '.join(map(str, one_view))}"))
     if not np.isfinite(markers.position_mm).all(axis=1).any():
-        findings.append(("no-object-markers", "no object marker has coordinates"))
+        told = "no image of one focus meets one of another: no object on the films, or films exchanged, turned, or given twice"
+        findings.append(("no-object-markers", told))
     return findings
