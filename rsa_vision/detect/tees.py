@@ -22,6 +22,7 @@ ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
 _MOST_JUNCTIONS = 80
 _MOST_TOGETHER = 4  # tees in one fit; larger sets are cut where they overlap least
+_MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _NEAREST_PX = 3.0  # two tips nearer than this are one
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
@@ -158,12 +159,17 @@ def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: No
 def _peeled(film: NDArray[Any], starts: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Keep the starts that still have something to explain once better ones have taken their part."""
     kept: list[NeedleFit] = []
-    for start in starts:  # best likeness first
+    in_vain = 0
+    for start in starts:  # best likeness first: after a long row of failures only other things are left
+        if in_vain == _MOST_IN_VAIN:
+            break
+        in_vain += 1
         fit = fit_crossing(film, [start], optics.sigma_px, optics.mu_px, noise, others=_others(start, kept, optics, ends=True), steps=3)[0]
         deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > 0.3 * abs(start.depth)
         near = np.hypot(*(fit.position_px - start.position_px)) < 2 * _NEAREST_PX
         if deep and near and is_tee(fit, slack=ROUGH) and all(np.hypot(*(k.position_px - fit.position_px)) > _NEAREST_PX for k in kept):
             kept.append(fit)
+            in_vain = 0
     return kept
 
 
