@@ -6,7 +6,7 @@ estimated from it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,18 +15,13 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
-from rsa_vision.detect.find import (
-    MISFIT,
-    STRENGTH,
-    Optics,
-    first_look,
-    misfit,
-    significance_limit,
-)
+from rsa_vision.detect.find import MISFIT, STRENGTH, first_look, misfit, significance_limit
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import estimate_optics
+from rsa_vision.detect.pins import find_pins, look_for_pins, on_pins, optics_of_pins
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.flags import MarkerFlag
@@ -81,15 +76,19 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     """
     noise = estimate_noise(values, bits)
     candidates = find_candidates(values, STRENGTH, noise)
+    pins = look_for_pins(values, candidates.strokes, noise)
     seeds = first_look(values, candidates, noise)
+    seeds = seeds.rows(~on_pins(seeds.position_px, 1 - seeds.explained, pins))
     found = [
-        _one_polarity(values, bits, sign, optics, seeds, candidates, noise, false_detections)
-        for sign, optics in _polarities(values, seeds, candidates, noise)
+        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, noise, false_detections)
+        for sign, optics in _polarities(values, seeds, pins, candidates, noise)
     ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
 
-def _polarities(film: NDArray[Any], seeds: BallFits, candidates: Candidates, noise: NoiseModel) -> list[tuple[int, Optics]]:
+def _polarities(
+    film: NDArray[Any], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
+) -> list[tuple[int, Optics]]:
     """Signs of depth worth looking at, with their optics; both only where neither is clearly the markers'."""
     weight, optics = {}, {}
     for sign in (-1, 1):
@@ -97,6 +96,8 @@ def _polarities(film: NDArray[Any], seeds: BallFits, candidates: Candidates, noi
         strength = -sign * candidates.junctions[:, 4]
         if balls < _LEAST_EVIDENCE and (strength > CLEAR_JUNCTION).any():
             optics[sign] = optics_of_tees(film, candidates.junctions[strength > CLEAR_JUNCTION], noise)
+        elif balls < _LEAST_EVIDENCE:
+            optics[sign], balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
         weight[sign] = balls + float(np.clip(strength - CLEAR_JUNCTION, 0.0, 20.0).sum())
     best = max(weight, key=lambda sign: weight[sign])
     if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():
@@ -110,6 +111,7 @@ def _one_polarity(
     sign: int,
     optics: Optics,
     seeds: BallFits,
+    rough_pins: list[NeedleFit],
     candidates: Candidates,
     noise: NoiseModel,
     false_detections: float,
@@ -117,34 +119,42 @@ def _one_polarity(
     seeds = seeds.rows(np.sign(seeds.depth) == sign)
     junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
     same = np.sign(candidates.strength) == -sign
-    mine = Candidates(
-        candidates.position_px[same], candidates.radius_px[same], candidates.strength[same], candidates.roundness[same], junctions
+    mine = replace(
+        candidates,
+        position_px=candidates.position_px[same],
+        radius_px=candidates.radius_px[same],
+        strength=candidates.strength[same],
+        roundness=candidates.roundness[same],
+        junctions=junctions,
     )
     tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
+    pins, pin_optics = find_pins(film, [p for p in rough_pins if np.sign(p.depth) == sign], tees, optics, noise)
 
-    def tee_images(cols: Float, rows: Float) -> Float:
+    needles = [(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]
+
+    def needle_images(cols: Float, rows: Float) -> Float:
         total = np.zeros(cols.shape)
         middle = np.array([cols.mean(), rows.mean()])
         reach = float(np.hypot(np.ptp(cols), np.ptp(rows))) / 2
-        for t in tees:
+        for t, seen in needles:
             if np.hypot(*(t.position_px - middle)) < reach + 1.3 * t.shape.length_px + 10:
                 dx, dy = (cols - t.position_px[0]).ravel(), (rows - t.position_px[1]).ravel()
-                total += needle_image(dx, dy, t, tee_optics.sigma_px, tee_optics.mu_px).reshape(cols.shape)
+                total += needle_image(dx, dy, t, seen).reshape(cols.shape)
         return total
 
-    balls, touching = resolve_balls(film, mine, seeds, optics, noise, tee_images if tees else None)
+    balls, touching = resolve_balls(film, mine, seeds, optics, noise, needle_images if needles else None)
     limit = significance_limit(film.size, 2.5, false_detections)
-    keep = are_balls(balls, limit, optics.sigma_px) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees)
+    keep = are_balls(balls, limit, optics.sigma_px) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching = balls.rows(keep), touching[keep]
     for fit in doubtful:
-        if found := part(film, fit, balls, optics, tee_optics, noise, tee_images, is_tee):
+        if found := part(film, fit, balls, optics, tee_optics, noise, needle_images, is_tee):
             tee, ball = found
             apart = np.hypot(*(balls.position_px - ball.position_px[0]).T) > ball.radius_px[0]
             balls = join([balls.rows(apart), ball])
             touching = np.append(touching[apart], True)
             tees = [*tees, tee]
-    images = _table(film, bits, balls, touching, tees, noise)
+    images = _table(film, bits, balls, touching, tees + pins, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
     return evidence, Detection(images, sign < 0, optics, noise)

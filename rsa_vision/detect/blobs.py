@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
-from rsa_vision.detect.find import Optics, plausible
+from rsa_vision.detect.find import plausible
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 LEAST_APART = 0.4  # of the radius: nearer centres cannot be told apart with confidence

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.junctions import find_junctions
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.strokes import COLUMNS, find_strokes
 from rsa_vision.types import Float
 
 BAND = 1024  # rows at full resolution that are in memory as float32 at once
@@ -24,6 +25,7 @@ BLOCK = 32  # side of the blocks of one pyramid level over which the spread is m
 SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
 ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
 JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for
+STROKE_SCALES = ((1, 2.6), (1, 4.4))  # those for single pins
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +44,8 @@ class Candidates:
         Ratio of the smaller to the larger curvature at the extremum: 1 round, 0 a ridge.
     junctions : ndarray of shape (m, 5)
         Points where three arms may meet, as :func:`rsa_vision.detect.junctions.find_junctions`.
+    strokes : ndarray of shape (k, 6)
+        What may be single pins, as :func:`rsa_vision.detect.strokes.find_strokes`.
     """
 
     position_px: Float
@@ -49,6 +53,7 @@ class Candidates:
     strength: Float
     roundness: Float
     junctions: Float
+    strokes: Float
 
 
 def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> Candidates:
@@ -69,21 +74,22 @@ def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> 
     """
     found: list[Float] = []
     junctions: list[Float] = []
+    strokes: list[Float] = []
     rows = film.shape[0]
     for start in range(0, rows, BAND):
         top, bottom = max(0, start - MARGIN), min(rows, start + BAND + MARGIN)
         top -= top % 8
         band = film[top:bottom]
         stop = start + BAND if start + BAND < rows else rows + BAND
-        for into, table in zip((found, junctions), _band_extrema(band, threshold, noise), strict=True):
+        for into, table in zip((found, junctions, strokes), _band_extrema(band, threshold, noise), strict=True):
             table[:, 1] += top
             into.append(table[(table[:, 1] >= start) & (table[:, 1] < stop)])
     table = np.concatenate(found)
     table = table[np.argsort(-np.abs(table[:, 3]))]
-    return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], np.concatenate(junctions))
+    return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], np.concatenate(junctions), np.concatenate(strokes))
 
 
-def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tuple[Float, Float]:
+def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tuple[Float, Float, Float]:
     pad = (-band.shape[0] % 8, -band.shape[1] % 8)
     if any(pad):
         band = cv2.copyMakeBorder(band, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
@@ -93,7 +99,7 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
         level_images[level] = image
         image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
     out = [np.zeros((0, 5))]
-    junctions = np.zeros((0, 5))
+    junctions, strokes = np.zeros((0, 5)), [np.zeros((0, COLUMNS))]
     for level, inner, outer, radius in SCALES:
         source = level_images[level]
         # outer minus inner: positive where the mark is darker than its surroundings
@@ -106,7 +112,9 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
         out.append(_extrema(answer, limit, level, radius, threshold))
         if (level, radius) == JUNCTION_SCALE:
             junctions = find_junctions(answer, limit, level)
-    return np.concatenate(out), junctions
+        if (level, radius) in STROKE_SCALES:
+            strokes.append(find_strokes(answer, limit, level))
+    return np.concatenate(out), junctions, np.concatenate(strokes)
 
 
 def _extrema(answer: NDArray[Any], limit: NDArray[Any], level: int, radius: float, threshold: float) -> Float:

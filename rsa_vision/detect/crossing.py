@@ -13,17 +13,18 @@ from rsa_vision.detect.balls import polynomial
 from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, beyond_ends, core_pixels, support
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 _STEPS = 16
 _CONVERGED_PX = 1e-3
+_GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
 
 
 def fit_crossing(
     film: NDArray[Any],
     needles: Sequence[NeedleFit],
-    sigma_px: float,
-    mu_px: float,
+    optics: Optics,
     noise: NoiseModel,
     *,
     others: Any = None,
@@ -37,7 +38,7 @@ def fit_crossing(
     film : ndarray of shape (rows, cols)
     needles : sequence of NeedleFit
         Starts.
-    sigma_px, mu_px : float
+    optics : Optics
     noise : NoiseModel
     others : callable, optional
         As of :func:`rsa_vision.detect.needles.fit_needles`.
@@ -55,7 +56,7 @@ def fit_crossing(
     now = list(needles)
     middle = np.mean([f.position_px for f in now], axis=0)
     spread = max(float(np.abs(f.position_px - middle).max()) for f in now)
-    half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in now) + 3 * sigma_px + 3))
+    half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in now) + 3 * optics.sigma_px + 3))
     patch = cut(film, middle[None], half, noise)
     corner = patch.corner_px[0].astype(np.float64)
     rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
@@ -64,9 +65,9 @@ def fit_crossing(
     keep = patch.valid[0].copy()
     for f in now:
         dx, dy = cols - f.position_px[0], rows - f.position_px[1]
-        near |= support(dx, dy, f.angles, f.shape, 3 * sigma_px + 4.0)
+        near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + 4.0)
         if not ends:
-            keep &= ~beyond_ends(dx, dy, f.angles, f.shape, sigma_px)
+            keep &= ~beyond_ends(dx, dy, f.angles, f.shape, optics.sigma_px)
     keep &= near
     cols, rows, raw = cols[keep], rows[keep], patch.values[0][keep]
     neighbours = np.zeros_like(raw)
@@ -79,12 +80,16 @@ def fit_crossing(
     n_shape = 2 if ends else 1
     each = 2 + n_shape + 1
     converged = False
+    ground = np.zeros(len(data))  # background above its mean under each pixel
     for step in range(steps + 1):
-        blocks = [arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, sigma_px, mu_px) for f in now]
+        blocks = [
+            arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, optics) * _gain(f, ground, optics) for f in now
+        ]
         images = [b[0].sum(0, keepdims=True) if ends else b[0] for b in blocks]
         counts = [len(i) for i in images]
         linear = np.column_stack([*np.concatenate(images), surface])
         theta = weighted_least_squares(linear, weight, data, 1e-6)
+        ground = surface[:, 1:] @ theta[-surface.shape[1] + 1 :]
         starts = np.concatenate([[0], np.cumsum(counts)])
         now = [
             replace(f, depths=np.broadcast_to(theta[a:b], f.angles.shape).copy()) for f, a, b in zip(now, starts, starts[1:], strict=False)
@@ -123,7 +128,7 @@ def fit_crossing(
                 background=float(theta[-6]),
                 covariance_px2=influence_covariance(influence[each * i : each * i + 2], noise.correlation),
                 n_core=int(core.sum()),
-                valid_fraction=min(1.0, int(core.sum()) / max(core_pixels(f.position_px, f.angles, f.shape, sigma_px, ends), 1)),
+                valid_fraction=min(1.0, int(core.sum()) / max(core_pixels(f.position_px, f.angles, f.shape, optics.sigma_px, ends), 1)),
                 chi2_core=chi2_core,
                 explained=1.0 - float(square[core].sum()) / max(raised, 1e-12),
                 misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
@@ -132,6 +137,14 @@ def fit_crossing(
             )
         )
     return out
+
+
+def _gain(fit: NeedleFit, ground: Float, optics: Optics) -> Float | float:
+    """Return the depth at each pixel in units of the depth at the middle, where it goes with the background."""
+    if not optics.proportion or not fit.depth:
+        return 1.0
+    gain: Float = np.clip(1.0 + optics.proportion * ground / fit.depth, *_GAIN)
+    return gain
 
 
 def _moved(fit: NeedleFit, delta: Float, half: int, ends: bool) -> NeedleFit:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from rsa_vision.detect.balls import BallFits, fit_balls, half_size, join
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import cut
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
@@ -22,14 +23,6 @@ MISFIT = (
     0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/detection.md
 )
 EXPLAINED = 0.9
-
-
-@dataclass(frozen=True, slots=True)
-class Optics:
-    """What is common to all marks of a film: blur and attenuation, per pixel."""
-
-    sigma_px: float
-    mu_px: float
 
 
 def fit_at(

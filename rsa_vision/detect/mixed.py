@@ -12,11 +12,12 @@ from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect.balls import BallFits, ball_image, polynomial
 from rsa_vision.detect.crossing import fit_crossing
-from rsa_vision.detect.find import Optics, plausible
+from rsa_vision.detect.find import plausible
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.needles import NeedleFit, arm_images, needle_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 _ROUNDS = 5
@@ -59,7 +60,7 @@ def part(
 
     def without_tee(cols: Float, rows: Float) -> Float:
         dx, dy = cols - tee.position_px[0], rows - tee.position_px[1]
-        return beside(cols, rows) + needle_image(dx, dy, tee, tee_optics.sigma_px, tee_optics.mu_px)
+        return beside(cols, rows) + needle_image(dx, dy, tee, tee_optics)
 
     def without_ball(cols: Float, rows: Float) -> tuple[Float, Bool]:
         dx, dy = (cols - ball.position_px[0, 0]).reshape(1, -1), (rows - ball.position_px[0, 1]).reshape(1, -1)
@@ -69,7 +70,7 @@ def part(
     place = _brightest_rest(film, tee, np.sign(depth), without_tee)
     ball = fit_group(film, place[None], np.array([radius]), optics.sigma_px, optics.mu_px, noise, without_tee)
     for _ in range(_ROUNDS):
-        tee = fit_crossing(film, [tee], tee_optics.sigma_px, tee_optics.mu_px, noise, others=without_ball, steps=6)[0]
+        tee = fit_crossing(film, [tee], tee_optics, noise, others=without_ball, steps=6)[0]
         ball = fit_group(film, ball.position_px, ball.radius_px, optics.sigma_px, optics.mu_px, noise, without_tee)
     alike = abs(np.log(ball.radius_px[0] / radius)) < 0.25 and 0.4 < ball.depth[0] / depth < 2.5
     if not (alike and plausible(ball, noise).all() and is_tee(tee)):
@@ -87,7 +88,7 @@ def _joint_covariance(
     patch = cut(film, tee.position_px[None], half, noise)
     rows, cols = np.mgrid[0 : patch.size, 0 : patch.size].reshape(2, -1).astype(np.float64) + patch.corner_px[0][::-1, None]
     dx, dy = cols - tee.position_px[0], rows - tee.position_px[1]
-    arms, *moves, turn = arm_images(dx, dy, tee.angles, tee.shape, tee_optics.sigma_px, tee_optics.mu_px)
+    arms, *moves, turn = arm_images(dx, dy, tee.angles, tee.shape, tee_optics)
     (x, y), radius, depth = ball.position_px[0], ball.radius_px[0], ball.depth[0]
 
     def image(x: float, y: float, radius: float) -> Float:

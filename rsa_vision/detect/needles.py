@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from rsa_vision.detect.balls import polynomial
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 CELL = 0.3  # pixels between the nodes of a needle table
@@ -87,7 +88,7 @@ class NeedleFit:
 
 
 @lru_cache(maxsize=512)
-def _opacity(half_width: float, length: float, taper: float, sigma: float, mu: float) -> tuple[Float, float, float]:
+def _opacity(half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float) -> tuple[Float, float, float]:
     pad = _PAD * sigma
     s = np.arange(-pad, length + pad + CELL, CELL)
     p = np.arange(0.0, half_width + pad + CELL, CELL)  # one half; the other is its mirror image
@@ -99,15 +100,19 @@ def _opacity(half_width: float, length: float, taper: float, sigma: float, mu: f
     opacity = (-np.expm1(-2 * mu * np.sqrt(square))).reshape(len(s), 2, len(p), 2).mean((1, 3))
     along = gaussian_filter1d(opacity, sigma / CELL, axis=0, mode="constant", truncate=4.5)
     half = gaussian_filter1d(along, sigma / CELL, axis=1, mode="mirror", truncate=4.5)
+    if bend:
+        half = np.log1p(-bend * half) / np.log1p(-bend)
     return np.concatenate([half[:, :0:-1], half], axis=1), float(s[0]), -float(p[-1])
 
 
 @lru_cache(maxsize=128)
-def _table(half_width: float, length: float, taper: float, sigma: float, mu: float) -> tuple[Float, tuple[int, int], float, float]:
+def _table(
+    half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float
+) -> tuple[Float, tuple[int, int], float, float]:
     """Opacity, its slopes along and across the needle, and by half width and length: the last axis, so that one look-up finds all five."""
-    base, s0, p0 = _opacity(half_width, length, taper, sigma, mu)
-    wide, *_, p1 = _opacity(round(half_width + GRID_W, 4), length, taper, sigma, mu)
-    long, *_ = _opacity(half_width, round(length + GRID_L, 4), taper, sigma, mu)
+    base, s0, p0 = _opacity(half_width, length, taper, sigma, mu, bend)
+    wide, *_, p1 = _opacity(round(half_width + GRID_W, 4), length, taper, sigma, mu, bend)
+    long, *_ = _opacity(half_width, round(length + GRID_L, 4), taper, sigma, mu, bend)
     side = round((p0 - p1) / CELL)
     by_width = (wide[: base.shape[0], side : side + base.shape[1]] - base) / GRID_W
     by_length = (long[: base.shape[0]] - base) / GRID_L
@@ -134,7 +139,7 @@ def _look_up(table: tuple[Float, tuple[int, int], float, float], s: Float, p: Fl
     return out
 
 
-def needle_image(dx: Float, dy: Float, fit: NeedleFit, sigma_px: float, mu_px: float) -> Float:
+def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
     """Return the image of a fitted pin or tee, in film values over the background.
 
     Parameters
@@ -142,22 +147,23 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, sigma_px: float, mu_px: f
     dx, dy : ndarray
         Offsets (col, row) of the pixels from the common tip.
     fit : NeedleFit
-    sigma_px, mu_px : float
+    optics : Optics
 
     Returns
     -------
     ndarray of the shape of ``dx``
     """
-    values = arm_images(dx.ravel(), dy.ravel(), fit.angles, fit.shape, sigma_px, mu_px)[0]
+    values = arm_images(dx.ravel(), dy.ravel(), fit.angles, fit.shape, optics)[0]
     image: Float = (fit.depths @ values).reshape(dx.shape)
     return image
 
 
-def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float, mu: float) -> Float:
+def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> Float:
     """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the first axis."""
     # tables stand on a grid of shapes, shared by all needles of a film; in between the image is linear in the shape
     off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % GRID_L
-    table = _table(round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4), shape.taper, round(sigma, 3), round(mu, 4))
+    film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
+    table = _table(round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4), shape.taper, *film)
     arms = []
     for angle in angles:
         c, s = np.cos(angle), -np.sin(angle)
@@ -209,8 +215,7 @@ def fit_needles(
     tip_px: Float,
     angles: Float,
     shape: NeedleShape,
-    sigma_px: float,
-    mu_px: float,
+    optics: Optics,
     noise: NoiseModel,
     *,
     others: Any = None,
@@ -229,7 +234,7 @@ def fit_needles(
         Start, radians.
     shape : NeedleShape
         Start; its taper is kept.
-    sigma_px, mu_px : float
+    optics : Optics
     noise : NoiseModel
     others : callable, optional
         ``others(cols, rows)`` returns the images of neighbours at these pixels, in film values, which are subtracted first, and a mask of
@@ -247,14 +252,14 @@ def fit_needles(
     -------
     NeedleFit
     """
-    half = int(np.ceil(shape.length_px * 1.15 + shape.half_width_px + 3 * sigma_px + 3))
+    half = int(np.ceil(shape.length_px * 1.15 + shape.half_width_px + 3 * optics.sigma_px + 3))
     patch = cut(film, tip_px[None], half, noise)
     corner = patch.corner_px[0]
     rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
     cols, rows = cols + float(corner[0]), rows + float(corner[1])
-    keep = patch.valid[0] & support(cols - tip_px[0], rows - tip_px[1], angles, shape, 3 * sigma_px + (1.0 if quick else 4.0))
+    keep = patch.valid[0] & support(cols - tip_px[0], rows - tip_px[1], angles, shape, 3 * optics.sigma_px + (1.0 if quick else 4.0))
     if not ends:
-        keep &= ~beyond_ends(cols - tip_px[0], rows - tip_px[1], angles, shape, sigma_px)
+        keep &= ~beyond_ends(cols - tip_px[0], rows - tip_px[1], angles, shape, optics.sigma_px)
     cols, rows, raw = cols[keep], rows[keep], patch.values[0][keep]
     neighbours = np.zeros_like(raw)
     if others is not None:
@@ -275,7 +280,7 @@ def fit_needles(
     n_free = 2 + n_shape + n_turn
     steps, close = (6, _CLOSE_PX) if quick else (_STEPS, _CONVERGED_PX)
     for step in range(steps + 1):
-        value, d_col, d_row, d_w, d_l, d_angle = arm_images(cols - tip[0], rows - tip[1], angles, shape, sigma_px, mu_px)
+        value, d_col, d_row, d_w, d_l, d_angle = arm_images(cols - tip[0], rows - tip[1], angles, shape, optics)
         linear = np.column_stack([*(value.sum(0, keepdims=True) if n_depth < k else value), surface])
         if step == 0 or step == steps or converged:
             theta = weighted_least_squares(linear, weight, data)
@@ -317,7 +322,7 @@ def fit_needles(
     background = float(theta[n_depth])
     variance = float(noise.variance_at(np.array([background]))[0])
     spread = covariance[n_free : n_free + n_depth, n_free : n_free + n_depth].mean()  # variance of the mean depth
-    full = core_pixels(tip, angles, shape, sigma_px, ends)
+    full = core_pixels(tip, angles, shape, optics.sigma_px, ends)
     return NeedleFit(
         position_px=tip,
         angles=angles,
@@ -348,7 +353,8 @@ def core_pixels(tip: Float, angles: Float, shape: NeedleShape, sigma: float, end
         c, s = np.cos(angle), -np.sin(angle)
         along = (cols - frac[0]) * c + (rows - frac[1]) * s
         across = -(cols - frac[0]) * s + (rows - frac[1]) * c
-        inside |= (along > 0) & (along < stop) & (np.abs(across) < shape.half_width_px * along / (shape.taper * shape.length_px))
+        width = shape.half_width_px * np.minimum(along / (shape.taper * shape.length_px), 1.0)
+        inside |= (along > 0) & (along < stop) & (np.abs(across) < width)
     return int(inside.sum())
 
 

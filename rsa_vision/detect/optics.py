@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
-from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, Optics, fit_at, misfit, refine, significance
+from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, fit_at, misfit, refine, significance
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 SIGMAS_PX = (0.55, 0.75, 1.05, 1.5, 2.1, 2.9)

@@ -22,6 +22,33 @@ _X_STEP, _Y_STEP = 0.04, 0.02  # of rho / sigma, and of log(r / sigma), in the f
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """What is common to all marks of a film.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Blur: standard deviation of screen, focal spot and pixel together.
+    mu_px : float
+        Attenuation per pixel of chord. It takes part of the bend of the film curve: flatter tops, more attenuation.
+    bend : float
+        The rest of that bend, below 1, which no attenuation can stand for: the value of the film goes with ``-log(1 - bend * opacity)``, as
+        optical density does. 0: none.
+    proportion : float
+        Change of a needle's depth with the background along it, both in film values: on a film that is linear in exposure a mark takes away
+        a part of what is there, on a logarithmic one always the same.
+    rough : bool
+        The blur is a guess to improve upon.
+    """
+
+    sigma_px: float
+    mu_px: float
+    bend: float = 0.0
+    proportion: float = 0.0
+    rough: bool = False
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class BallTable:
     """Blurred opacity of a ball and its derivatives on a grid of (log(r/sigma), rho/sigma).

@@ -14,9 +14,10 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls import BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.find import MISFIT, Optics, distinct, fit_at, misfit, plausible
+from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
 
 Background = Callable[[Float, Float], Float]

@@ -7,28 +7,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.crossing import fit_crossing
-from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, Optics, refine
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles, needle_image, thick_ends
+from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
+from rsa_vision.detect.needle_sets import TAPERS, clusters, common_optics, fit_all, others_beside
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.templates import find_like
 from rsa_vision.detect.twins import split_twins
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Float
 
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
 _MOST_JUNCTIONS = 80
-_MOST_TOGETHER = 4  # tees in one fit; larger sets are cut where they overlap least
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _NEAREST_PX = 3.0  # two tips nearer than this are one
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
-TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
 _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
-_ATTENUATIONS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.2)  # of the arms, relative to the balls
 
 
 def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], list[NeedleFit], Optics]:
@@ -54,22 +51,22 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
         return [], [], optics
     tees = _like(film, models, optics, noise)
     for _ in range(2):
-        tees = _distinct(_fit_all(film, tees, optics, noise, ends=True), models[0])
+        tees = _distinct(fit_all(film, tees, optics, noise, ends=True), models[0])
     if not tees:
         return [], [], optics
     around = tees
 
     def beside(mine: list[NeedleFit]) -> Any:
-        return _others(mine, [t for t in around if all(t is not m for m in mine)], optics, ends=True)
+        return others_beside(mine, [t for t in around if all(t is not m for m in mine)], optics, ends=True)
 
     tees = split_twins(film, tees, optics, noise, is_tee, beside)
-    optics = _attenuation(film, tees, optics, noise)
-    tees = _fit_all(film, tees, optics, noise, ends=True)
+    optics = common_optics(film, tees, optics, noise)
+    tees = fit_all(film, tees, optics, noise, ends=True)
     offsets, error = _common_directions(film, tees, optics, noise)
     if offsets is not None:
         tees = [replace(t, angles=_mean_turn(t.angles, offsets) + offsets) for t in tees]
     # with the directions held, the slanted thick ends can no longer turn the arms: they may lend their weight
-    tees = _fit_all(film, tees, optics, noise, ends=offsets is not None)
+    tees = fit_all(film, tees, optics, noise, ends=offsets is not None)
     return [_with_error(t, error) for t in tees if is_tee(t)], [t for t in tees if not is_tee(t) and is_tee(t, slack=ROUGH)], optics
 
 
@@ -93,7 +90,7 @@ def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> O
 
     costs = {sigma: left(sigma) for sigma in _BLURS_PX}
     best = min(costs, key=lambda sigma: costs[sigma])
-    return Optics(best if np.isfinite(costs[best]) else COARSE_SIGMA_PX, COARSE_MU_PX)
+    return Optics(best if np.isfinite(costs[best]) else COARSE_SIGMA_PX, COARSE_MU_PX, rough=True)
 
 
 def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
@@ -132,7 +129,7 @@ def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Op
     for col, row, angle, ring, _ in junctions:
         start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
         angles = angle + np.array([0.0, np.pi / 2, -np.pi / 2])
-        fit = fit_needles(film, np.array([col, row]), angles, start, optics.sigma_px, optics.mu_px, noise, rigid=True)
+        fit = fit_needles(film, np.array([col, row]), angles, start, optics, noise, rigid=True)
         if is_tee(fit, slack=ROUGH):
             rough.append(fit)
         if sum(is_tee(f) for f in rough) >= ENOUGH:
@@ -148,7 +145,7 @@ def _mean_misfit(fits: list[NeedleFit]) -> float:
 def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Starts at every place that looks like one of the models."""
     starts: list[NeedleFit] = []
-    places = [(likeness, col, row, m) for m in models for col, row, likeness in find_like(film, m, optics.sigma_px, optics.mu_px)]
+    places = [(likeness, col, row, m) for m in models for col, row, likeness in find_like(film, m, optics)]
     for _, col, row, model in sorted(places, key=lambda p: -p[0]):
         at = np.array([col, row])
         if all(np.hypot(*(s.position_px - at)) > _NEAREST_PX for s in starts):
@@ -164,7 +161,8 @@ def _peeled(film: NDArray[Any], starts: list[NeedleFit], optics: Optics, noise: 
         if in_vain == _MOST_IN_VAIN:
             break
         in_vain += 1
-        fit = fit_crossing(film, [start], optics.sigma_px, optics.mu_px, noise, others=_others(start, kept, optics, ends=True), steps=3)[0]
+        others = others_beside(start, kept, optics, ends=True)
+        fit = fit_crossing(film, [start], optics, noise, others=others, steps=3)[0]
         deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > 0.3 * abs(start.depth)
         near = np.hypot(*(fit.position_px - start.position_px)) < 2 * _NEAREST_PX
         if deep and near and is_tee(fit, slack=ROUGH) and all(np.hypot(*(k.position_px - fit.position_px)) > _NEAREST_PX for k in kept):
@@ -182,86 +180,20 @@ def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
     return kept
 
 
-def _fit_all(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel, *, ends: bool) -> list[NeedleFit]:
-    """Fit every set of tees whose arms cross in one go, with the images of the other tees subtracted."""
-    out: list[NeedleFit] = []
-    for members in _clusters(tees):
-        rest = [t for t in tees if all(t is not m for m in members)]
-        others = _others(members, rest, optics, ends=ends)
-        out += fit_crossing(film, members, optics.sigma_px, optics.mu_px, noise, others=others, ends=ends)
-    return out
-
-
-def _clusters(tees: list[NeedleFit]) -> list[list[NeedleFit]]:
-    if not tees:
-        return []
-    position = np.array([t.position_px for t in tees])
-    gap = np.hypot(*(position[:, None] - position[None]).transpose(2, 0, 1))
-    length = np.array([t.shape.length_px for t in tees])
-    reach = (length[:, None] + length[None]) * 1.02
-    while True:  # arms that only just touch can do with subtraction, if joining them all would make too large a fit
-        n, label = connected_components(csr_array(gap < reach), directed=False)
-        if n == len(tees) or np.bincount(label).max() <= _MOST_TOGETHER:
-            return [[tees[i] for i in np.nonzero(label == k)[0]] for k in range(n)]
-        reach = reach * 0.85
-
-
-def _others(members: NeedleFit | list[NeedleFit], rest: list[NeedleFit], optics: Optics, *, ends: bool) -> Any:
-    """Images of the tees beside these, for the fits to subtract; None where there are none."""
-    mine = members if isinstance(members, list) else [members]
-    near = []
-    for t in rest:
-        gaps = [np.hypot(*(t.position_px - m.position_px)) - 1.3 * (t.shape.length_px + m.shape.length_px) for m in mine]
-        if min(gaps) < 10:
-            near.append(t)
-    if not near:
-        return None
-
-    def images(cols: Float, rows: Float) -> tuple[Float, Bool]:
-        total, doubtful = np.zeros_like(cols), np.zeros(cols.shape, bool)
-        for t in near:
-            dx, dy = cols - t.position_px[0], rows - t.position_px[1]
-            total += needle_image(dx, dy, t, optics.sigma_px, optics.mu_px)
-            if not ends:
-                doubtful |= thick_ends(dx, dy, t.angles, t.shape, optics.sigma_px)
-        return total, doubtful
-
-    return images
-
-
-def _attenuation(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel) -> Optics:
-    """Estimate the attenuation along the arms from the cleanest tees, by maximum likelihood."""
-    alone = [c[0] for c in _clusters(tees) if len(c) == 1] or tees
-    sample = sorted(alone, key=lambda f: f.misfit)[:6]
-
-    def cost(mu: float) -> float:
-        trial = Optics(optics.sigma_px, mu)
-        fits = [
-            fit_crossing(
-                film, [t], trial.sigma_px, mu, noise, others=_others(t, [o for o in tees if o is not t], trial, ends=False), ends=False
-            )
-            for t in sample
-        ]
-        return float(sum(np.log(max(f[0].chi2_core, 0.05)) for f in fits))
-
-    mus = tuple(optics.mu_px * f for f in _ATTENUATIONS)
-    return Optics(optics.sigma_px, refine(mus, [cost(mu) for mu in mus]))
-
-
 def _common_directions(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel) -> tuple[Float | None, Float]:
     """Return the directions of the arms relative to the first, if the film's tees share them, and their standard errors.
 
     Arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along the arms meet, so what is known of their
     directions sharpens it. Directions are taken from tees that stand alone, each arm free.
     """
-    alone = [c[0] for c in _clusters(tees) if len(c) == 1]
+    alone = [c[0] for c in clusters(tees) if len(c) == 1]
     sample = sorted(alone if len(alone) >= _LEAST_PARALLEL else tees, key=lambda f: f.misfit)[:16]
     if len(sample) < _LEAST_PARALLEL:
         return None, np.zeros(3)
     free = []
     for t in sample:
-        others = _others(t, [o for o in tees if o is not t], optics, ends=False)
-        fit = fit_needles(film, t.position_px, t.angles, t.shape, optics.sigma_px, optics.mu_px, noise, others=others, ends=False)
+        others = others_beside(t, [o for o in tees if o is not t], optics, ends=False)
+        fit = fit_needles(film, t.position_px, t.angles, t.shape, optics, noise, others=others, ends=False)
         if is_tee(fit, slack=1.5):
             free.append(np.angle(np.exp(1j * (fit.angles - fit.angles[0]))))
     if len(free) < _LEAST_PARALLEL:

@@ -6,6 +6,7 @@ show what one looks like, and the correlation with that image has a peak of its 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -13,20 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.needles import NeedleFit, needle_image
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 LIKENESS = 0.4  # correlation coefficient from which a place is worth a fit; two tees one over the other reach 0.5 to 0.7
 SCALE = 2  # the film is searched at half resolution
 
 
-def find_like(film: NDArray[Any], known: NeedleFit, sigma_px: float, mu_px: float) -> Float:
+def find_like(film: NDArray[Any], known: NeedleFit, optics: Optics) -> Float:
     """Find places that look like a known tee.
 
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
     known : NeedleFit
-    sigma_px, mu_px : float
+    optics : Optics
         Blur and attenuation of the film.
 
     Returns
@@ -34,10 +36,11 @@ def find_like(film: NDArray[Any], known: NeedleFit, sigma_px: float, mu_px: floa
     ndarray of shape (n, 3)
         col_px, row_px, correlation coefficient; best first.
     """
-    half = int(np.ceil(known.shape.length_px + 2 * sigma_px + 2) // SCALE * SCALE)
+    half = int(np.ceil(known.shape.length_px + 2 * optics.sigma_px + 2) // SCALE * SCALE)
     small = cv2.resize(film, (film.shape[1] // SCALE, film.shape[0] // SCALE), interpolation=cv2.INTER_AREA).astype(np.float32)
     axis = SCALE * (np.arange(-half // SCALE, half // SCALE + 1, dtype=np.float64))
-    template = needle_image(*np.meshgrid(axis, axis), known, float(np.hypot(sigma_px, SCALE / np.sqrt(12))), mu_px).astype(np.float32)
+    coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, SCALE / np.sqrt(12))))
+    template = needle_image(*np.meshgrid(axis, axis), known, coarse).astype(np.float32)
     if min(small.shape) <= template.shape[0]:
         return np.zeros((0, 3))
     likeness = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.crossing import fit_crossing
-from rsa_vision.detect.find import Optics
 from rsa_vision.detect.needles import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 Judge = Callable[[NeedleFit], bool]
@@ -80,7 +80,7 @@ def _split(
         if tried == 1 and offsets and best[1]:
             break
         starts = [replace(model, position_px=tee.position_px + side * offset / 2) for side in (-1, 1)]
-        pair = fit_crossing(film, starts, optics.sigma_px, optics.mu_px, noise, others=others, steps=10)
+        pair = fit_crossing(film, starts, optics, noise, others=others, steps=10)
         depths = sorted(abs(p.depth) for p in pair)
         apart = np.hypot(*(pair[1].position_px - pair[0].position_px)) > APART_PX[0] / 2
         alike = depths[1] < _ALIKE * depths[0] and np.sign(pair[0].depth) == np.sign(pair[1].depth) == np.sign(model.depth)

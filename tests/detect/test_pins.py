@@ -1,0 +1,70 @@
+"""Single pointed pins: found at their tips with honest errors, whichever film; rods are none."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from rsa_vision.detect import detect_markers
+from rsa_vision.types import Float
+from synthetic.chords import chord_pin
+
+PITCH_MM, MU_PER_MM, SIGMA_PX, QUANTA, FINE = 0.1, 8.0, 1.0, 4000.0, 5
+SIDE, CELLS = 640, 4
+
+
+def film_of_pins(
+    rng: np.random.Generator, *, taper: float | None = None, base: Float | float = 0.6, bright: bool = False
+) -> tuple[np.ndarray, Float, Float]:
+    """Sixteen pins of 0.5 x 2 mm in all directions, exact chords; tips and directions away from them, both (n, 2), (col, row)."""
+    clear = np.ones((SIDE, SIDE))
+    cell, half = SIDE // CELLS, 34
+    tips, ways = [], []
+    for row, col in np.ndindex(CELLS, CELLS):
+        tip = np.array([col + 0.5, row + 0.5]) * cell + rng.uniform(-15, 15, 2)
+        turn = rng.uniform(0, 2 * np.pi)
+        way = np.array([np.cos(turn), np.sin(turn)])
+        corner = tip.astype(int) - half
+        line = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5
+        x, y = np.meshgrid(line + corner[0] - tip[0], line + corner[1] - tip[1])
+        origin, down = np.array([x * PITCH_MM, y * PITCH_MM, 0 * x]), np.array([0 * x, 0 * x, 0 * x + 1])
+        chord = chord_pin(origin, down, np.zeros(3), np.array([*way, 0.0]), 2.0, 0.25, taper)
+        left = np.exp(-MU_PER_MM * chord).reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
+        clear[corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= left
+        tips.append(tip)
+        ways.append(way)
+    counts = rng.poisson(base * gaussian_filter(clear, SIGMA_PX) * QUANTA) / QUANTA
+    values = 60000 - 50000 * counts if bright else 50000 * counts
+    return np.clip(np.rint(values), 0, 65535).astype(np.uint16), np.array(tips), np.array(ways)
+
+
+@pytest.mark.parametrize("kind", ["cones", "cylinders with a point", "bright", "on a gradient"])
+def test_finds_all_tips_within_their_stated_errors(kind: str) -> None:
+    rng = np.random.default_rng(5)
+    gradient = 0.3 + 0.5 * np.arange(SIDE) / SIDE
+    values, tips, ways = film_of_pins(
+        rng,
+        taper=1.0 if kind.startswith("cyl") else None,
+        bright=kind == "bright",
+        base=gradient if "gradient" in kind else 0.6,
+    )
+    found = detect_markers(values, bits=16).images
+    assert found.shape.tolist() == ["pin"] * len(tips)
+    nearest = np.hypot(*(found.position_px[:, None] - tips).transpose(2, 0, 1)).argmin(axis=1)
+    assert sorted(nearest) == list(range(len(tips)))
+    error, way = found.position_px - tips[nearest], ways[nearest]
+    across = np.stack([-way[:, 1], way[:, 0]], axis=1)
+    for direction, limit_px in ((way, 0.5), (across, 0.1)):  # the tip fades out along the pin
+        missed = np.einsum("ni,ni->n", error, direction)
+        stated = np.sqrt(np.einsum("ni,nij,nj->n", direction, found.covariance_px2, direction))
+        assert np.sqrt(np.mean(missed**2)) < limit_px
+        # the errors along the pins share those of the film's blur and attenuation: sixteen are fewer than they seem
+        assert 0.5 < np.sqrt(np.mean((missed / stated) ** 2)) < 2.0
+    angle = np.rad2deg(np.arctan2(-way[:, 1], way[:, 0]))
+    assert np.abs((found.angle_deg - angle + 180) % 360 - 180).max() < 1.0
+
+
+def test_a_rod_is_no_pin() -> None:
+    values, tips, _ = film_of_pins(np.random.default_rng(6), taper=0.0)
+    found = detect_markers(values, bits=16).images
+    assert not (found.shape == "pin").any(), "blunt at both ends: neither is a tip"
+    assert len(tips)
