@@ -11,12 +11,11 @@ their columns. On bone the bound knows nothing of the background's curvature, an
 from __future__ import annotations
 
 import argparse
-import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -83,15 +82,19 @@ def ours(film: TestFilm) -> Score:
 
 
 def theirs(film: TestFilm, rival: Rival) -> Score:
-    """Score a rival; on pins and tees it is given the constant offset of its answer from the tips."""
+    """Score a rival; of pins and the stems of tees it sees the thick end, and is given its constant offset from the tip."""
     case = film.case
     start = time.process_time()
     found = rival(film.values, case.radius_px, film.brighter)
     seconds = time.process_time() - start
+    pointed = case.shape in ("pin", "tee")
+    if pointed:
+        found = found - 0.75 * case.length_px * np.array([np.cos(film.turn), -np.sin(film.turn)])
     marks, rows, n_false = match(film, found)
     error = found[rows] - film.position_px[marks]
-    if case.shape in ("pin", "tee") and len(error):
+    if pointed and len(error):
         error = error - np.median(error, axis=0)
+        n_false = max(0, n_false - len(film.companions_px) - (2 * len(film.position_px) if case.shape == "tee" else 0))
     bound = {name: b[marks] for name, b in film.bound_px2.items()}
     return Score(film, error, bound, None, np.zeros(len(rows)), len(film.position_px), n_false, 0, seconds)
 
@@ -111,7 +114,7 @@ def summary(scores: list[Score]) -> dict[str, object]:
             out["RMS / bound"] = f"{np.sqrt((error**2).sum(1).mean() / trace):.2f}"
             out["robust"] = f"{np.sqrt(np.median(_squares(error, bound)) / (2 * np.log(2))):.2f}"
         else:
-            out[f"({name})"] = f"{np.sqrt((error**2).sum(1).mean() / trace):.2f}"
+            out[f"RMS / bound ({name})"] = f"{np.sqrt((error**2).sum(1).mean() / trace):.2f}"
     if all(s.covariance_px2 is not None for s in scores):
         covariance = np.vstack([s.covariance_px2 for s in scores if s.covariance_px2 is not None])
         square = _squares(error, covariance)
@@ -132,36 +135,35 @@ def _squares(error: Float, covariance: Float) -> Float:
 Rows = list[dict[str, object]]
 
 
-def sweep(cases: Iterable[tuple[dict[str, object], Case]], films: int, seed: int, with_rivals: bool = False) -> Rows:
-    """Score all cases; every row begins with its own labels."""
+def sweep(cases: Iterable[tuple[dict[str, object], Case]], films: int, seed: int, rivals_at: Callable[[Case], bool]) -> Rows:
+    """Score all cases, where wanted also the rivals, on the first film; every row begins with its own labels."""
     rows: Rows = []
     for label, case in cases:
         made = [make_film(case, seed + k) for k in range(films)]
         rows.append({**label, "detector": "ours", **summary([ours(f) for f in made])})
         print(rows[-1], flush=True)
-        for name, rival in RIVALS.items() if with_rivals else ():
+        for name, rival in RIVALS.items() if rivals_at(case) else ():
             rows.append({**label, "detector": name, **summary([theirs(f, rival) for f in made[:1]])})
             print(rows[-1], flush=True)
     return rows
 
 
-def _large_film() -> tuple[Case, TestFilm]:
-    case = Case("ball", 4.0, 20.0, "bone", "screen", "density", 16, side_px=(4000, 4750), across=8)
-    return case, make_film(case, 1)
+def _large_film() -> TestFilm:
+    return make_film(Case("ball", 4.0, 20.0, "bone", "screen", "density", 16, side_px=(4000, 4750), across=8), 1)
 
 
 def speed(repeats: int) -> Rows:
     """Time one large film on one thread, against SimpleBlobDetector as OpenCV sets it up, and measure memory in processes of their own."""
-    case, film = _large_film()
+    film = _large_film()
     image = eight_bit(film.values)
     p = cv2.SimpleBlobDetector_Params()
     p.blobColor = 255 if film.brighter else 0
 
-    def seconds(what: object) -> float:
+    def seconds(what: Callable[[], object]) -> float:
         times = []
         for _ in range(repeats):
             start = time.perf_counter()
-            what()  # type: ignore[operator]
+            what()
             times.append(time.perf_counter() - start)
         return min(times)
 
@@ -183,19 +185,25 @@ def speed(repeats: int) -> Rows:
 
 def memory() -> None:
     """Print the bytes by which the peak of this process grows while the large film is measured."""
-    path = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path.cwd()  # noqa: S108  # a name of our own
+    path = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path.cwd()
     path = path / f"large_film_{time.time_ns()}.npy"
     make = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import detection, numpy; "
-    make += f"numpy.save({str(path)!r}, detection._large_film()[1].values)"
+    make += f"numpy.save({str(path)!r}, detection._large_film().values)"
     subprocess.run([sys.executable, "-c", make], check=True)  # rendering takes more memory than measuring: in a process of its own
     try:
         detect_markers(make_film(Case(side_px=(300, 300), across=2), 1).values, bits=16)  # what is loaded once is not the film's
         film = np.load(path)
     finally:
         path.unlink()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    Path("/proc/self/clear_refs").write_text("5")  # the high-water mark starts anew; ru_maxrss would still hold that of the parent
+    before = _status_bytes("VmRSS")
     detect_markers(film, bits=16)
-    print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
+    print(_status_bytes("VmHWM") - before)
+
+
+def _status_bytes(name: str) -> int:
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name))
+    return 1024 * int(line.split()[1])
 
 
 def table(rows: Rows) -> str:
@@ -247,44 +255,41 @@ def main() -> None:
     films, seed, quick = 1 if args.quick else args.films, args.seed, args.quick
     cnrs, radii = (CNRS[1:3], (2.5, 5.0)) if quick else (CNRS, RADII)
     begin = time.process_time()
-    few = Case(side_px=(1500, 1500), across=6, shape="pair", companions=True)
 
-    balls = sweep((({"radius, px": r, "CNR": c}, Case("ball", r, c)) for r in radii for c in cnrs), films, seed, True)
-    grounds = sweep(
-        (({"background": b, "CNR": c}, Case("ball", 4.0, c, b)) for b in ("flat", "gradient", "bone") for c in cnrs), films, seed
-    )
-    responses = sweep(
+    def run(cases: Iterable[tuple[dict[str, object], Case]], films: int, rivals_at: Callable[[Case], bool] = lambda _: False) -> Rows:
+        return sweep(cases, films, seed, rivals_at)
+
+    balls = run((({"radius, px": r, "CNR": c}, Case("ball", r, c)) for r in radii for c in cnrs), films, lambda _: True)
+    backgrounds = ("gradient", "bone") if quick else ("flat", "gradient", "bone")
+    grounds = run((({"background": b, "CNR": c}, Case("ball", 4.0, c, b)) for b in backgrounds for c in cnrs), films)
+    responses = run(
         (
             ({"response": r, "bits": b}, Case("ball", 4.0, 20.0, "gradient", response=r, bits=b))
             for r in ("linear", "density", "log", "transmission")
             for b in ((8,) if quick else (8, 16))
         ),
         1,
-        seed,
     )
-    noises = sweep((({"noise": n, "CNR": c}, Case("ball", 4.0, c, noise=n)) for n in ("quantum", "screen") for c in cnrs), films, seed)
+    noises = run((({"noise": n, "CNR": c}, Case("ball", 4.0, c, noise=n)) for n in ("quantum", "screen") for c in cnrs), films)
     pins = {
-        shape: sweep(
+        shape: run(
             (
-                ({"half width, px": r, "CNR": c, "alone": "no"}, Case(shape, r, c, companions=True))
-                for r in ((2.5,) if quick else (2.0, 2.5, 4.0))
-                for c in cnrs
+                ({"half width, px": r, "CNR": c, "balls beside": "yes" if b else "no"}, Case(shape, r, c, companions=b))
+                for r, b in (((2.5, True), (2.5, False)) if quick else ((2.0, True), (2.5, True), (4.0, True), (2.5, False)))
+                for c in (cnrs if b else (20.0,))
             ),
-            1 if shape == "pin" else films,
-            seed,
+            films,
+            lambda case: case.companions and (case.radius_px, case.cnr) == (2.5, 20.0),
         )
-        + sweep((({"half width, px": 2.5, "CNR": 20.0, "alone": "yes"}, Case(shape, 2.5, 20.0)) for _ in (0,)), films, seed)
-        + sweep((({"half width, px": 2.5, "CNR": 20.0, "alone": "no"}, Case(shape, 2.5, 20.0, companions=True)) for _ in (0,)), 1, seed, True)[1:]
         for shape in ("tee", "pin")
     }
-    pairs = sweep(
+    pairs = run(
         (
-            ({"apart, diameters": a, "CNR": c}, replace(few, apart=a, cnr=c))
+            ({"apart, diameters": a, "CNR": c}, Case("pair", 4.0, c, apart=a, companions=True, across=6))
             for a in ((0.5, 1.0) if quick else (0.5, 0.6, 0.8, 1.0, 1.2))
             for c in ((20.0,) if quick else (50.0, 20.0, 10.0))
         ),
-        1,
-        seed,
+        films,
     )
     clock = speed(1 if quick else 3)
     real = real_tables(args.real)
@@ -296,7 +301,11 @@ def main() -> None:
     text = ["# Marker images", "", (__doc__ or "").strip(), ""]
     text += [f"Made by `{command}` in {(time.process_time() - begin) / 60:.0f} minutes of one processor.", ""]
     text += [f"![RMS error against CNR for balls of {len(radii)} radii]({args.page.stem}.svg)", ""]
-    text += ["Rivals are told the radius and the polarity: " + " ".join(f"*{n}*: {(f.__doc__ or '').strip()}" for n, f in RIVALS.items()), ""]
+    text += [
+        "Rivals are told the radius and the polarity, and of pins and tees where the thick end of the pin or stem lies from the tip:",
+        "",
+    ]
+    text += [f"- {' '.join((f.__doc__ or '').split())}" for f in RIVALS.values()] + [""]
     for title, rows in {
         "Balls, flat background, white noise": balls,
         "Backgrounds (balls of radius 4 px)": grounds,

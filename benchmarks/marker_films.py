@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ from synthetic.scanner import Response, Scanner
 
 Float = NDArray[np.float64]
 
-FINE = 5  # samples along a pixel
+FINE, FINER = 5, 9  # samples along a pixel: of films, and of the derivatives, where nearly equal ones must be told apart
 PRIMARY = 0.8  # of the exposure; the rest is scatter, which no marker stops
 TANTALUM_MM = 0.8  # diameter of the balls: their attenuation is 8 per mm at every pitch
 PER_MM = 8.0
@@ -135,44 +135,42 @@ def _reach(case: Case, sigma: float) -> int:
     return math.ceil(size + 5 * sigma + 2)
 
 
-def _fine_opacity(case: Case, phase: tuple[float, float], parameters: tuple[float, ...], sigma: float) -> Float:
-    half = _reach(case, sigma)
-    line = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
+def _fine_opacity(case: Case, phase: tuple[float, float], parameters: tuple[float, ...], sigma: float, fine: int, half: int) -> Float:
+    line = (np.arange((2 * half + 1) * fine) + 0.5) / fine - 0.5 - half
     x, y = np.meshgrid(line - phase[0], line - phase[1])
     opacity = -np.expm1(-case.per_px * _chord(case.shape, x, y, parameters))
-    return gaussian_filter(opacity, sigma * FINE, mode="constant", truncate=5.0)
+    return gaussian_filter(opacity, sigma * fine, mode="constant", truncate=5.0)
 
 
-def _binned(fine: Float) -> Float:
-    n = fine.shape[0] // FINE
-    return fine.reshape(n, FINE, n, FINE).mean((1, 3))
+def _binned(image: Float, fine: int) -> Float:
+    n = image.shape[0] // fine
+    return np.asarray(image.reshape(n, fine, n, fine).mean((1, 3)))
 
 
 def opacity(case: Case, phase: tuple[float, float], parameters: tuple[float, ...], sigma: float) -> Float:
     """Return the part of the primary exposure that a mark takes away, over pixels whose middle one is (0, 0)."""
-    return _binned(_fine_opacity(case, phase, parameters, sigma))
+    return _binned(_fine_opacity(case, phase, parameters, sigma, FINE, _reach(case, sigma)), FINE)
 
 
 @lru_cache(maxsize=256)
 def _derivatives(case: Case, parameters: tuple[float, ...], sigma: float) -> dict[str, Float]:
     """Opacity and its derivatives by position, blur and shape."""
-    fine = _fine_opacity(case, PHASE, parameters, sigma)
-    out = {"value": _binned(fine)}
-    out["row"], out["col"] = (_binned(-np.gradient(fine, 1 / FINE, axis=axis)) for axis in (0, 1))
-    render = partial(opacity, case, PHASE)
-    out["blur"] = (_same(render(parameters, sigma + 0.02), out["value"]) - _same(render(parameters, sigma - 0.02), out["value"])) / 0.04
-    for k in range(len(parameters)):
-        step = np.eye(len(parameters))[k] * 0.02
-        high, low = (render(tuple(np.asarray(parameters) + s), sigma) for s in (step, -step))
-        out[str(k)] = (high - low) / 0.04
-    return out
+    half = _reach(case, sigma)
+
+    def render(parameters: tuple[float, ...], sigma: float) -> Float:
+        return _fine_opacity(case, PHASE, parameters, sigma, FINER, half)
+
+    middle = render(parameters, sigma)
+    out = {"value": middle}
+    out["row"], out["col"] = (-np.gradient(middle, 1 / FINER, axis=axis) for axis in (0, 1))
+    out["blur"] = (render(parameters, sigma + 0.05) - render(parameters, sigma - 0.05)) / 0.1
+    for k, step in enumerate(STEPS[case.shape]):
+        high, low = (render(tuple(np.asarray(parameters) + s), sigma) for s in np.eye(len(parameters))[k] * [[step], [-step]])
+        out[str(k)] = (high - low) / (2 * step)
+    return {key: _binned(image, FINER) for key, image in out.items()}
 
 
-def _same(image: Float, like: Float) -> Float:
-    cut = (image.shape[0] - like.shape[0]) // 2
-    return image[cut : cut + len(like), cut : cut + len(like)] if cut >= 0 else np.pad(image, -cut)
-
-
+STEPS = {"ball": (0.1,), "pair": (0.1,) * 4, "pin": (0.01, 0.1, 0.1), "tee": (0.01, 0.1, 0.1, 0.01, 0.01, 0.05, 0.05)}
 # what is estimated beside position, amplitude and the background's level and slopes; the first is the one that ratios refer to
 VARIANTS: dict[str, dict[str, tuple[str, ...]]] = {
     "ball": {"radius free": ("0",), "radius known": (), "radius, blur free": ("0", "blur")},
@@ -301,7 +299,8 @@ def make_film(case: Case, seed: int) -> TestFilm:
         for name, covariance in _bounds(case, parameters, sigma, level, sd).items():
             limits[name] += list(covariance) if case.shape == "pair" else [covariance]
     values = _stored(case, scanner, exposure, sd, rng)
-    return TestFilm(case, values, np.array(truth), {name: np.array(c) for name, c in limits.items()}, turn, np.array(companions).reshape(-1, 2))
+    bound = {name: np.array(covariances) for name, covariances in limits.items()}
+    return TestFilm(case, values, np.array(truth), bound, turn, np.array(companions).reshape(-1, 2))
 
 
 def _shade(exposure: Float, middle: NDArray[np.intp], image: Float) -> None:

@@ -65,8 +65,8 @@ def _pig(folder: Path) -> Rows:
 
 def _camera(path: Path) -> Float:
     """Return the 3 x 4 projection matrix of a calibration file."""
-    blocks = [np.array([[float(v) for v in line.split(",")] for line in b.splitlines()[1:]]) for b in path.read_text().split("\n\n") if b.strip()]
-    _, camera, rotation, translation = blocks[:4]
+    blocks = [block.strip().splitlines()[1:] for block in path.read_text().split("\n\n") if block.strip()]
+    _, camera, rotation, translation = (np.array([[float(v) for v in line.split(",")] for line in block]) for block in blocks[:4])
     return np.asarray(camera @ np.hstack([rotation, translation.reshape(3, 1)]))
 
 
