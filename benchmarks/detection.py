@@ -6,6 +6,10 @@ radius; among pins, tees and pairs every fourth mark is a single ball, which is 
 background over the noise of one pixel. RMS errors are of one coordinate. The bound is that of the noise model with position, amplitude, the
 background's level and slopes, and for balls the radius, for pins and tees direction, half width and length estimated; other variants have
 their columns. On bone the bound knows nothing of the background's curvature, and real estimators cannot reach it.
+
+*robust*: the same ratio from the median instead of the mean square. *flagged*: with any flag but `overlap`; *beyond 4 sd, unflagged*: the
+confident wrong ones. Rivals measure the first film only. On pins and tees they are given the direction and the constant part of their
+error, so that their ratio can be below 1, and only detections beyond one for each pin, arm and ball count as false.
 """
 
 from __future__ import annotations
