@@ -1,6 +1,6 @@
 """Marker images against the Cramér-Rao bound, stated against true errors, and against the detectors that others use.
 
-Films of 1500 x 1500 pixels with 49 marks (pairs: 36 sites) at random fractions of a pixel, blur sigma 0.8 to 1.5 px, a fifth of the
+Films of 1500 x 1500 pixels with 49 marks (pairs: 36 sites) at random fractions of a pixel, blur sigma 0.8 to 1.5 px, half of the
 exposure scattered. Balls are of 0.8 mm tantalum, pins and tees those of cage 1A (0.5 mm, full cones of 2 mm), at the pitch that gives the
 radius; among pins, tees and pairs every fourth mark is a single ball, which is not measured. CNR: largest departure of a mark from its
 background over the noise of one pixel. RMS errors are of one coordinate. The bound is that of the noise model with position, amplitude, the
@@ -257,7 +257,7 @@ def main() -> None:
         memory()
         return
     films, seed, quick = 1 if args.quick else args.films, args.seed, args.quick
-    cnrs, radii = (CNRS[1:3], (2.5, 5.0)) if quick else (CNRS, RADII)
+    cnrs, radii = (CNRS[1::2], (2.5, 5.0)) if quick else (CNRS, RADII)
     begin = time.process_time()
 
     def run(cases: Iterable[tuple[dict[str, object], Case]], films: int, rivals_at: Callable[[Case], bool] = lambda _: False) -> Rows:

@@ -24,12 +24,12 @@ from synthetic.scanner import Response, Scanner
 Float = NDArray[np.float64]
 
 FINE, FINER = 5, 9  # samples along a pixel: of films, and of the derivatives, where nearly equal ones must be told apart
-PRIMARY = 0.8  # of the exposure; the rest is scatter, which no marker stops
+PRIMARY = 0.5  # of the exposure; the rest is scatter, which no marker stops: noise of CNR 5 must not reach the ends of the value range
 TANTALUM_MM = 0.8  # diameter of the balls: their attenuation is 8 per mm at every pitch
 PER_MM = 8.0
 PIN_HALF_MM, PIN_LENGTH_MM = 0.25, 2.0  # of cage 1A
 SCREEN_PX, SCREEN_PART = 0.8, 0.8  # correlated noise: blur of its screen part, and that part of its variance; the rest is white
-EXPOSURE = (0.45, 1.1)  # darkest and brightest background: on the steep part of the film curve, below the largest value
+EXPOSURE = (0.6, 0.95)  # darkest and brightest background
 PHASE = (0.23, -0.31)  # where in its pixel a mark lies whose bound is calculated; the bound hardly depends on it
 
 
