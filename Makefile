@@ -22,7 +22,8 @@ lint: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html
 
-bench: $(STAMP)  ## long: rendered films measured and compared with the truth
+bench: $(STAMP)  ## long: marker images against the bound, rendered films against the truth
+	$(BIN)/python benchmarks/detection.py
 	$(BIN)/python benchmarks/reach.py
 
 lock:  ## renew requirements.lock (hashes, no addresses)
