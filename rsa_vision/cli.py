@@ -88,7 +88,7 @@ def measure(
     out: Out,
     cage: CageOption = None,
     study: Annotated[Path | None, typer.Option("--study", help="Study file; default: study.toml in FOLDER, if there.")] = None,
-    segments: Annotated[Path | None, typer.Option("--segments", help="Known segments (refused until built).")] = None,
+    segments: Annotated[Path | None, typer.Option("--segments", help="CSV file of the known segments.")] = None,
     method: Annotated[str, typer.Option("--method", help="selvik (bundle is refused until built).")] = "selvik",
     jobs: Annotated[int, typer.Option("--jobs", "-j", help="Number of processes.")] = 1,
     dask: Annotated[str | None, typer.Option("--dask", help="Address of a scheduler (refused until built).")] = None,
@@ -163,11 +163,12 @@ def reconstruct(
     out: Out,
     cage: CageOption = None,
     study: StudyOption = None,
+    segments: Annotated[Path | None, typer.Option("--segments", help="CSV file of the known segments, to name the markers by.")] = None,
 ) -> int:
     """Reconstruct markers from image coordinates that were measured elsewhere."""
     from rsa_vision import api
 
-    summary = api.reconstruct(points, out, cage=cage, study=study)
+    summary = api.reconstruct(points, out, cage=cage, study=study, segments=segments)
     _print_summary(summary)
     return summary.exit_code
 

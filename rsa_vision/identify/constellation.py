@@ -76,7 +76,7 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -
         n = len(segment)
         rivals = [
             (_odds(placement, len(pairs), volume, stray) + len(pairs) * np.log(FOUND) + (n - len(pairs)) * np.log(1 - FOUND), pairs)
-            for pairs, placement in candidate_poses(segment, points)
+            for pairs, placement in candidate_poses(segment, points, float(np.log(volume / stray)))
         ]
         for odds, pairs in _likeliest(rivals):
             owner.append(index)
@@ -139,7 +139,7 @@ def _bodies_once(before: Cloud, points: Cloud, volume: float) -> tuple[dict[tupl
         ways = float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
         return _odds(placement, k, volume, m) + k * float(np.log(FOUND)) - ways
 
-    rivals = _likeliest([(odds(*found), found[0]) for found in candidate_poses(before, points)])
+    rivals = _likeliest([(odds(*found), found[0]) for found in candidate_poses(before, points, float(np.log(volume / max(m, 1))))])
     listed = {pairs for _, pairs in rivals}
     for part in disjoint([pairs for value, pairs in rivals[:MOST_PARTS] if value > 0]):
         if part not in listed and (placement := place(before, points, part)) and (value := odds(part, placement)) > NEGLIGIBLE:

@@ -26,6 +26,7 @@ THIN_MM: Final = 1.0  # height of a triangle that determines no pose
 ROTATION_RAD: Final = 1.0  # sd to which an undetermined rotation is known
 FARTHEST_MM: Final = 3.0  # a first pose from three points predicts others no worse
 MOST: Final = 400  # first poses that are refined, those with the most markers first
+MOST_CLIMBED: Final = 40  # of these, from which better ones are sought
 CHUNK: Final = 2000
 
 Pairs = tuple[tuple[int, int], ...]
@@ -136,33 +137,39 @@ def place(body: Cloud, points: Cloud, pairs: Pairs) -> Placement | None:
     return Placement(rotated, shifted, centre + step[best, 3:], covariance[best], total, sigmas)
 
 
-def candidate_poses(body: Cloud, points: Cloud) -> list[tuple[Pairs, Placement]]:
+def candidate_poses(body: Cloud, points: Cloud, log_worth: float) -> list[tuple[Pairs, Placement]]:
     """List the assignments of a body's markers to points that a rigid motion explains, three markers or more each.
 
     Parameters
     ----------
     body, points : Cloud
+    log_worth : float
+        Gain in log likelihood, with densities in 1/mm³, for a point that need not be explained otherwise.
 
     Returns
     -------
     list of (pairs, Placement)
-        Every assignment once: those that grow from any three markers with the right distances, and of each the ones next to it (one marker
-        left out, or on another point that is near enough).
+        Every assignment once: those that grow from any three markers with the right distances, the better ones on the way from these to
+        the best next to them, and all next to that (one marker left out, or on a point that is near enough).
     """
     if min(len(body), len(points)) < LEAST_POINTS:
         return []
-    found: dict[Pairs, Placement] = {}
-    for pairs in _first_assignments(body, points):
-        _add(_refined(body, points, pairs), body, points, found)
-    for pairs, placement in list(found.items()):
-        for other in _neighbours(body, points, pairs, placement):
-            _add(other, body, points, found)
-    return list(found.items())
+    found: dict[Pairs, Placement | None] = {}
 
+    def value(pairs: Pairs) -> float:
+        if pairs not in found:
+            found[pairs] = place(body, points, pairs) if len(pairs) >= LEAST_POINTS else None
+        placement = found[pairs]
+        return -np.inf if placement is None else placement.log_likelihood + len(pairs) * log_worth
 
-def _add(pairs: Pairs, body: Cloud, points: Cloud, found: dict[Pairs, Placement]) -> None:
-    if len(pairs) >= LEAST_POINTS and pairs not in found and (placement := place(body, points, pairs)):
-        found[pairs] = placement
+    starts = {_refined(body, points, pairs) for pairs in _first_assignments(body, points)}
+    climbed: set[Pairs] = set()
+    for start in sorted(starts, key=lambda pairs: (-value(pairs), pairs))[:MOST_CLIMBED]:
+        pairs = start
+        while pairs not in climbed and (placement := found[pairs]):
+            climbed.add(pairs)
+            pairs = max((pairs, *_neighbours(body, points, pairs, placement)), key=value)
+    return [(pairs, placement) for pairs, placement in found.items() if placement]
 
 
 def volume_mm3(points: Cloud) -> float:
