@@ -6,7 +6,7 @@ of the probabilities of all that give it. Below the limit there is no name.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -111,45 +111,80 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
 
     Notes
     -----
-    What is decisive is taken out, and the rest looked at again: three points left over on both sides show what three of many cannot.
+    What is decisive is fixed, and the rest looked at again: three points left over on both sides show what three of many cannot, and a
+    group that shares three names or more with what is fixed is judged by what it adds.
     """
     volume = volume_mm3(points)
-    mine, theirs = np.arange(len(before)), np.arange(len(points))
+    listed = candidate_poses(before, points, float(np.log(volume / max(len(points), 1))))
+    listed += _parts(before, points, listed)
+    named: dict[int, int] = {}
     bodies: list[Pairs] = []
+    chosen: list[Pairs] = []
     while True:
-        old, new = before.rows(mine), points.rows(theirs)
-        names, chosen = _bodies_once(old, new, volume)
-        decisive = [tuple(pair for pair in body if names.get(pair, 0.0) >= posterior) for body in chosen]
-        found = [body for body in decisive if body]
+        mine, theirs = _others(len(before), named.keys()), _others(len(points), named.values())
+        left = candidate_poses(before.rows(mine), points.rows(theirs), float(np.log(volume / max(len(theirs), 1)))) if named else []
+        again = [(tuple((int(mine[i]), int(theirs[a])) for i, a in pairs), placement) for pairs, placement in left]
+        rivals = _additions(before, points, {**dict(listed), **dict(again)}, named, volume)
+        chances, chosen = _summed(rivals, len(points))
+        found = [kept for body in chosen if (kept := tuple(pair for pair in body if chances[pair] >= posterior))]
         if not found:
             break
-        bodies += [tuple((int(mine[i]), int(theirs[a])) for i, a in body) for body in found]
-        mine = np.delete(mine, [i for body in found for i, _ in body])
-        theirs = np.delete(theirs, [a for body in found for _, a in body])
+        bodies += found
+        named |= {i: a for body in found for i, a in body}
     doubtful = np.zeros(len(points), bool)
-    doubtful[[int(theirs[a]) for body in chosen for _, a in body]] = True
+    doubtful[[a for body in chosen for _, a in body]] = True
     return bodies, doubtful
 
 
-def _bodies_once(before: Cloud, points: Cloud, volume: float) -> tuple[dict[tuple[int, int], float], list[Pairs]]:
-    n, m = len(before), len(points)
+def _others(n: int, taken: Iterable[int]) -> Int:
+    return np.setdiff1d(np.arange(n), list(taken)).astype(np.int64)
 
-    def odds(pairs: Pairs, placement: Placement) -> float:
-        k = len(pairs)  # any k of the n may be the body
-        ways = float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
-        return _odds(placement, k, volume, m) + k * float(np.log(FOUND)) - ways
 
-    rivals = _likeliest([(odds(*found), found[0]) for found in candidate_poses(before, points, float(np.log(volume / max(m, 1))))])
-    listed = {pairs for _, pairs in rivals}
-    for part in disjoint([pairs for value, pairs in rivals[:MOST_PARTS] if value > 0]):
-        if part not in listed and (placement := place(before, points, part)) and (value := odds(part, placement)) > NEGLIGIBLE:
-            rivals.append((value, part))
-            listed.add(part)
+def _parts(before: Cloud, points: Cloud, listed: Sequence[tuple[Pairs, Placement]]) -> list[tuple[Pairs, Placement]]:
+    """Take overlapping bodies apart: bodies that have moved little against each other fit one pose in parts."""
+    largest: list[Pairs] = []
+    for pairs, _ in sorted(listed, key=lambda one: (-len(one[0]), -one[1].log_likelihood, one[0])):
+        if len(largest) < MOST_PARTS and not any(set(pairs) <= set(other) for other in largest):
+            largest.append(pairs)
+    known = dict(listed)
+    parts = [part for part in disjoint(largest) if part not in known]
+    return [(part, placement) for part in parts if (placement := place(before, points, part))]
+
+
+def _additions(
+    before: Cloud, points: Cloud, listed: Mapping[Pairs, Placement], named: Mapping[int, int], volume: float
+) -> list[tuple[float, Pairs]]:
+    """Return the log odds of what each group adds to the names, that contradict none."""
+    n, m = len(before) - len(named), len(points) - len(named)
+    owner = {a: i for i, a in named.items()}
+    base: dict[Pairs, float] = {}
+    rivals: dict[Pairs, float] = {}
+    for pairs, placement in listed.items():
+        if any(named.get(i, a) != a or owner.get(a, i) != i for i, a in pairs):
+            continue
+        old, new = tuple(pair for pair in pairs if pair[0] in named), tuple(pair for pair in pairs if pair[0] not in named)
+        k = len(new)
+        if not new or 0 < len(old) < LEAST_POINTS:
+            continue
+        odds = k * float(np.log(FOUND)) - _log_ways(n, k)  # any k may be the body
+        if not old:
+            odds += _odds(placement, k, volume, m)
+        else:
+            if old not in base:
+                base[old] = fixed.log_likelihood if (fixed := place(before, points, old)) else np.inf
+            odds += placement.log_likelihood - base[old] - k * float(np.log(m / volume)) - _log_ways(len(named), len(old))
+        rivals[new] = max(rivals.get(new, -np.inf), odds)
+    return _likeliest([(odds, pairs) for pairs, odds in rivals.items()])
+
+
+def _log_ways(n: int, k: int) -> float:
+    return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+
+
+def _summed(rivals: Sequence[tuple[float, Pairs]], m: int) -> tuple[dict[tuple[int, int], float], list[Pairs]]:
     groups = [pairs for _, pairs in rivals]
-    claims = [(*(a for _, a in pairs), *(m + i for i, _ in pairs)) for pairs in groups]
-    packing = pack(claims, np.array([value for value, _ in rivals]))
-    names = _names(groups, np.nan_to_num(packing.posterior))
-    return names, [groups[g] for g in np.flatnonzero(packing.chosen)]
+    packing = pack([(*(a for _, a in pairs), *(m + i for i, _ in pairs)) for pairs in groups], np.array([odds for odds, _ in rivals]))
+    return _names(groups, np.nan_to_num(packing.posterior)), [groups[g] for g in np.flatnonzero(packing.chosen)]
 
 
 def _odds(placement: Placement, k: int, volume: float, stray: float) -> float:
