@@ -131,7 +131,7 @@ def place(body: Cloud, points: Cloud, pairs: Pairs) -> Placement | None:
     covariance = np.linalg.inv(normal)
     leverage = np.einsum("kia,ab,kib->k", by_pose[0], covariance[0], jacobian) / 3
     sigmas = np.sqrt(squares[0] / 3 / np.maximum(1 - leverage, 1 / len(pairs)))
-    turn = _rotation(step[best, :3])
+    turn = rotation_by(step[best, :3])
     rotated = turn @ rotation
     shifted = turn @ (translation - centre) + centre + step[best, 3:]
     return Placement(rotated, shifted, centre + step[best, 3:], covariance[best], total, sigmas)
@@ -180,7 +180,8 @@ def volume_mm3(points: Cloud) -> float:
     return float(4 / 3 * np.pi * np.prod(np.sqrt(5 * np.maximum(axes, axes.mean() / 2) + 1.0)))
 
 
-def _rotation(vector: Float) -> Float:
+def rotation_by(vector: Float) -> Float:
+    """Return the matrix of a rotation vector (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector / angle if angle > 0 else vector
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
