@@ -7,21 +7,36 @@ belongs to none keeps the name that it got when it was first seen. Nothing is me
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
 from rsa_vision.flags import MarkerFlag, flag_names, flag_value
+from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.constellation import LOOSE_SIGMA, Known, match_bodies, match_segments
-from rsa_vision.identify.poses import LEAST_POINTS, Cloud, place
+from rsa_vision.identify.hidden import Sighting, find_with_rays, hidden_markers
+from rsa_vision.identify.poses import LEAST_POINTS, TOLERANCE_MM, Cloud, place, volume_mm3
 from rsa_vision.segments import Segment, Segments, segments_of
 from rsa_vision.settings import Limits
-from rsa_vision.tables import Row, Rows, split_name
+from rsa_vision.sightlines import free_rays
+from rsa_vision.tables import SCHEMAS, Row, Rows, split_name
+from rsa_vision.types import Float
 from rsa_vision.verdict import Finding, conclude
 
 MOST_EARLIER: Final = 6  # examinations that one is compared with: the first, and the last ones before it
 AXES: Final = ("x_mm", "y_mm", "z_mm")
+
+
+@dataclass(frozen=True, eq=False)
+class _Hidden:
+    """A marker without rays of its own from two foci: its place by its segment, and its images with their focus and ray."""
+
+    name: str
+    place_mm: Float
+    covariance_mm2: Float
+    images: Mapping[int, tuple[int, RayBundle]]
+    flags: int
 
 
 @dataclass(eq=False)
@@ -34,6 +49,7 @@ class _Exam:
     names: list[str] = field(default_factory=list)  # of these, empty where unknown
     flags: list[int] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
+    hidden: list[_Hidden] = field(default_factory=list)
 
 
 def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) -> list[Rows]:
@@ -94,21 +110,73 @@ def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) 
     if not segments:
         exam.findings.append(("marker-mismatch", f"segments.csv knows no segment of subject {exam.rows['exams'][0]['subject']}"))
         return
-    matched = match_segments([Cloud.exact(segment.position_mm) for segment in segments], exam.cloud, limits.posterior)
-    for segment, known in zip(segments, matched, strict=True):
-        for i, a in (*known.pairs, *known.loose):
+    bodies = [Cloud.exact(segment.position_mm) for segment in segments]
+    matched = match_segments(bodies, exam.cloud, limits.posterior)
+    sightings = _sightings(exam, bodies, matched, limits)
+    for segment, known, sighting in zip(segments, matched, sightings, strict=True):
+        for i, a in (*known.pairs, *known.loose, *sighting.pairs):
             exam.names[a] = f"{segment.name}/{segment.markers[i]}"
         for _, a in known.loose:
             exam.flags[a] |= MarkerFlag.LOOSE
         for _, a in known.doubtful:
             exam.flags[a] |= MarkerFlag.AMBIGUOUS
-        exam.findings += _segment_findings(segment, known, limits)
+        seen = {i for i, _ in (*sighting.pairs, *sighting.sights)}
+        lost = tuple(i for i in known.lost if i not in seen)
+        exam.findings += _segment_findings(segment, replace(known, lost=lost), sighting, limits)
+        if sighting.placement is not None:
+            exam.hidden += _hidden(segment, sighting, exam)
     extra = [_name(row) for row, name in zip(exam.located, exam.names, strict=True) if not name]
     if extra:
         exam.findings.append(("marker-mismatch", f"{len(extra)} markers belong to no known segment"))
 
 
-def _segment_findings(segment: Segment, known: Known, limits: Limits) -> list[Finding]:
+def _sightings(exam: _Exam, bodies: Sequence[Cloud], matched: Sequence[Known], limits: Limits) -> list[Sighting]:
+    """Look for the markers that are missing among single images; what two segments claim goes to neither."""
+    rays = free_rays(exam.rows)
+    nothing = Sighting((), (), None, decisive=True)
+    if not len(rays):
+        return [nothing] * len(bodies)
+    volume = max(volume_mm3(cloud) for cloud in (exam.cloud, *bodies))
+    taken = {a for known in matched for _, a in (*known.pairs, *known.loose, *known.doubtful)}
+    free = np.array([a for a in range(len(exam.cloud)) if a not in taken], dtype=np.int64)
+    found = []
+    for body, known in zip(bodies, matched, strict=True):
+        if known.placement is not None:
+            seen = known.pairs if not known.loose else tuple(pair for pair in known.pairs if pair not in known.loose)
+            missing = set(known.lost)
+            sighting = hidden_markers(body, exam.cloud, seen, known.placement, rays, missing, volume, limits.posterior)
+        elif not known.doubtful:
+            sighting = find_with_rays(body, exam.cloud.rows(free), rays, volume, limits.posterior)
+            sighting = replace(sighting, pairs=tuple((i, int(free[a])) for i, a in sighting.pairs))
+        else:
+            sighting = nothing
+        found.append(sighting if sighting.decisive else replace(nothing, decisive=False))
+    claims = [claim for one in found for claim in {("image", rays.image[r]) for _, r in one.sights} | {("point", a) for _, a in one.pairs}]
+    return [
+        replace(nothing, decisive=False)
+        if any(claims.count(claim) > 1 for claim in [*(("image", rays.image[r]) for _, r in one.sights), *(("point", a) for _, a in one.pairs)])
+        else replace(one, sights=tuple((i, int(r)) for i, r in one.sights), rays=rays)
+        for one in found
+    ]
+
+
+def _hidden(segment: Segment, sighting: Sighting, exam: _Exam) -> list[_Hidden]:
+    """Return the markers that single images show, where the pose of their segment puts them."""
+    assert sighting.placement is not None
+    assert sighting.rays is not None
+    markers = sorted({i for i, _ in sighting.sights})
+    place_mm, by_pose = sighting.placement.predict(segment.position_mm[markers].reshape(-1, 3))
+    result = []
+    for k, i in enumerate(markers):
+        views = [r for marker, r in sighting.sights if marker == i]
+        images = {int(sighting.rays.image[r]): (int(sighting.rays.focus[r]), sighting.rays.rows(np.array([r]))) for r in views}
+        flags = int(MarkerFlag.PREDICTED | (MarkerFlag.ONE_VIEW if len(views) == 1 else 0))
+        covariance = by_pose[k] + TOLERANCE_MM**2 * np.eye(3)
+        result.append(_Hidden(f"{segment.name}/{segment.markers[i]}", place_mm[k], covariance, images, flags))
+    return result
+
+
+def _segment_findings(segment: Segment, known: Known, sighting: Sighting, limits: Limits) -> list[Finding]:
     def told(markers: Iterable[int]) -> str:
         return ", ".join(segment.markers[i] for i in markers)
 
@@ -118,7 +186,12 @@ def _segment_findings(segment: Segment, known: Known, limits: Limits) -> list[Fi
         findings.append(("constellation-ambiguous", doubt))
     if known.loose:
         findings.append(("marker-loose", f"segment {segment.name}: {told(i for i, _ in known.loose)} not where the others say"))
-    if known.placement is None and not known.doubtful:
+    if sighting.sights:
+        seen = told(sorted({i for i, _ in sighting.sights}))
+        findings.append(("marker-one-view", f"segment {segment.name}: {seen} seen from one focus only, predicted by the others"))
+    elif not sighting.decisive:
+        findings.append(("constellation-ambiguous", f"segment {segment.name}: single images fit its missing markers in more than one way"))
+    if known.placement is None and sighting.placement is None and not known.doubtful:
         findings.append(("marker-mismatch", f"segment {segment.name} was not found among the markers"))
     elif known.lost:
         findings.append(("marker-mismatch", f"segment {segment.name}: {told(known.lost)} not found"))
@@ -194,7 +267,28 @@ def _renamed(exam: _Exam) -> Rows:
         else row
         for row in exam.rows["images"]
     ]
+    for hidden in exam.hidden:
+        markers.append(_predicted(exam.rows["exams"][0], hidden))
+        for index, (focus, ray) in hidden.images.items():
+            images[index] = _seen(images[index], hidden, focus, ray)
     return {**exam.rows, "exams": [_judged(exam.rows["exams"][0], exam.findings)], "images": images, "markers": markers}
+
+
+def _predicted(exam: Row, hidden: _Hidden) -> Row:
+    segment, marker = split_name(hidden.name)
+    row: Row = dict.fromkeys(SCHEMAS["markers"]) | {"subject": exam["subject"], "exam": exam["exam"], "segment": segment, "marker": marker}
+    cov = hidden.covariance_mm2
+    row |= dict(zip(AXES, hidden.place_mm.tolist(), strict=True))
+    row |= dict(zip((f"sd_{axis}" for axis in AXES), np.sqrt(np.diagonal(cov)).tolist(), strict=True))
+    row |= {"cov_xy_mm2": float(cov[0, 1]), "cov_xz_mm2": float(cov[0, 2]), "cov_yz_mm2": float(cov[1, 2])}
+    return row | {"n_views": len(hidden.images), "flags": flag_names(hidden.flags)}
+
+
+def _seen(row: Row, hidden: _Hidden, focus: int, ray: RayBundle) -> Row:
+    through = ray.through_mm[0]
+    away = float(np.linalg.norm(np.cross(hidden.place_mm - through, ray.direction[0])))
+    named = {"focus": focus, "role": "object", "number": hidden.name, "residual_um": 1000 * away, "used": True}
+    return {**row, **named, **dict(zip(AXES, through.tolist(), strict=True)), "flags": _with_flags(row, int(MarkerFlag.ONE_VIEW))}
 
 
 def _free(name: str, taken: set[str]) -> str:

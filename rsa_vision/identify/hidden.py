@@ -7,7 +7,7 @@ marker competes as the names do (:mod:`constellation`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Final
@@ -54,12 +54,15 @@ class Sighting:
         By both; None if no pose is found.
     decisive : bool
         No other assignment or pose is nearly as likely.
+    rays : RayBundle or None
+        Those that `sights` count.
     """
 
     pairs: Pairs
     sights: Pairs
     placement: Placement | None
     decisive: bool
+    rays: RayBundle | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +133,16 @@ def place_with_rays(
     return Placement(rotation, translation, centre, np.linalg.inv(solved[best][1]), total, solved[0][3])
 
 
-def hidden_markers(body: Cloud, points: Cloud, pairs: Pairs, placement: Placement, rays: RayBundle, volume: float, posterior: float) -> Sighting:
+def hidden_markers(
+    body: Cloud,
+    points: Cloud,
+    pairs: Pairs,
+    placement: Placement,
+    rays: RayBundle,
+    missing: Collection[int],
+    volume: float,
+    posterior: float,
+) -> Sighting:
     """Find the missing markers of a segment whose pose is known among rays that belong to nothing.
 
     Parameters
@@ -140,6 +152,8 @@ def hidden_markers(body: Cloud, points: Cloud, pairs: Pairs, placement: Placemen
     placement : Placement
         By `pairs`.
     rays : RayBundle
+    missing : collection of int
+        Markers without a point.
     volume : float
         In which markers may be, mm³.
     posterior : float
@@ -151,7 +165,6 @@ def hidden_markers(body: Cloud, points: Cloud, pairs: Pairs, placement: Placemen
         ``decisive`` is False where a ray may be of a missing marker, but not decisively.
     """
     scene = _Scene(body, points, rays, volume, STRAY)
-    missing = [i for i in range(len(body)) if i not in dict(pairs)]
     away, log_density = _off_rays(body, rays, placement)
     marker, ray = np.nonzero(away < GATE)
     tried = [(int(i), int(r)) for i, r in zip(marker, ray, strict=True) if i in missing]
