@@ -21,6 +21,8 @@ from rsa_vision.study_files import natural_key
 if TYPE_CHECKING:
     import polars as pl
 
+    from rsa_vision.proposal import Proposal
+
 
 @dataclass(frozen=True, slots=True)
 class Summary:
@@ -279,6 +281,40 @@ def report(out: str | Path) -> Path:
     from rsa_vision.report import write_report
 
     return write_report(Path(out))
+
+
+def propose_segments(results: str | Path, out: str | Path | None = None) -> list[Proposal]:
+    """Suggest rigid groups of markers from several examinations; the command ``segments propose``.
+
+    Parameters
+    ----------
+    results : path
+        Folder of results, or its ``markers.csv``.
+    out : path, optional
+        ``segments.csv`` to write.
+
+    Returns
+    -------
+    list of Proposal
+        With a figure of how sure each is. Bodies that did not move against each other look like one.
+
+    Raises
+    ------
+    UsageError
+        If there are no results, no subject has two examinations, no group is found, or the file cannot be written.
+    """
+    from rsa_vision.proposal import propose
+    from rsa_vision.segments import segments_csv
+    from rsa_vision.store import read_tables
+
+    path = Path(results)
+    proposals, _ = propose(read_tables(path if path.is_dir() else path.parent)["markers"].to_dicts())
+    if not proposals:
+        raise UsageError(f"{path}: no three markers keep their distances in two examinations of a subject; measure more examinations")
+    if out is not None:
+        by_subject = {p.subject: [q.segment for q in proposals if q.subject == p.subject] for p in proposals}
+        write_atomic(Path(out), segments_csv(by_subject.items()).encode())
+    return proposals
 
 
 def demo(folder: str | Path = "rsa-vision-demo", *, seed: int = 1, watch: Watcher | None = None) -> list[Summary]:

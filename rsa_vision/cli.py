@@ -25,6 +25,8 @@ app = typer.Typer(
 )
 cage_app = typer.Typer(help="Built-in cages, drawings of cages, checks of cage files.", no_args_is_help=True)
 app.add_typer(cage_app, name="cage")
+segments_app = typer.Typer(help="Known segments.", no_args_is_help=True)
+app.add_typer(segments_app, name="segments")
 
 INTERRUPTED = 130  # as shells report Ctrl-C
 Result = TypeVar("Result")
@@ -237,6 +239,20 @@ def cage_check(file: Annotated[str, typer.Argument(metavar="FILE", help="Cage fi
 
     cage = load_cage(file)
     print(f"{file}: valid, cage {cage.name} with {len(cage.mark)} marks, sha256 {cage.sha256[:16]}")
+
+
+@segments_app.command("propose")
+def segments_propose(
+    results: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results with several examinations of a subject.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="segments.csv to write.")] = None,
+) -> None:
+    """Suggest rigid groups of markers, with how sure each is; look at them before you use them."""
+    from rsa_vision import api
+
+    for p in api.propose_segments(results, out):
+        figures = f"probability {p.probability:.4f}, distances change by {p.change_um:.0f} um (rms) in {p.n_exams} examinations"
+        print(f"{p.subject} {p.segment.name}: {', '.join(p.segment.markers)}; {figures}")
+    print(f"segments -> {out}" if out is not None else "to write them: add -o segments.csv")
 
 
 def _describe_cage(cage: Any) -> None:
