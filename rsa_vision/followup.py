@@ -14,9 +14,10 @@ import numpy as np
 
 from rsa_vision.flags import MarkerFlag, flag_names, flag_value
 from rsa_vision.geometry.rays import RayBundle
+from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.constellation import LOOSE_SIGMA, Known, match_bodies, match_segments
 from rsa_vision.identify.hidden import Sighting, find_with_rays, hidden_markers
-from rsa_vision.identify.poses import LEAST_POINTS, TOLERANCE_MM, Cloud, place, volume_mm3
+from rsa_vision.identify.poses import TOLERANCE_MM, Cloud, place, volume_mm3
 from rsa_vision.segments import Segment, Segments, segments_of
 from rsa_vision.settings import Limits
 from rsa_vision.sightlines import free_rays
@@ -154,7 +155,9 @@ def _sightings(exam: _Exam, bodies: Sequence[Cloud], matched: Sequence[Known], l
     claims = [claim for one in found for claim in {("image", rays.image[r]) for _, r in one.sights} | {("point", a) for _, a in one.pairs}]
     return [
         replace(nothing, decisive=False)
-        if any(claims.count(claim) > 1 for claim in [*(("image", rays.image[r]) for _, r in one.sights), *(("point", a) for _, a in one.pairs)])
+        if any(
+            claims.count(claim) > 1 for claim in [*(("image", rays.image[r]) for _, r in one.sights), *(("point", a) for _, a in one.pairs)]
+        )
         else replace(one, sights=tuple((i, int(r)) for i, r in one.sights), rays=rays)
         for one in found
     ]

@@ -106,5 +106,5 @@ def _together(clouds: Sequence[Cloud], members: Sequence[int]) -> tuple[list[int
                 best[here & ~known] = fit_rigid(place[here & known], best[here & known]).move(place[here & ~known])
             except GeometryError:
                 continue
-    known = np.isfinite(best).all(axis=1)
-    return [i for i, is_known in zip(chosen, known, strict=True) if is_known], best[known]
+    complete = np.flatnonzero(np.isfinite(best).all(axis=1)).tolist()
+    return [chosen[k] for k in complete], best[complete]

@@ -9,8 +9,8 @@ import numpy as np
 from rsa_vision.errors import GeometryError
 from rsa_vision.geometry.homography import apply_homography, fit_homography, homography_jacobians
 from rsa_vision.geometry.rays import RayBundle
+from rsa_vision.readings import joined_rays
 from rsa_vision.tables import Row, Rows
-from rsa_vision.types import Float
 
 SHAPE = "ball"
 LEAST_MARKS = 4
@@ -37,10 +37,13 @@ def free_rays(rows: Rows) -> RayBundle:
     free = [
         index
         for index, row in enumerate(rows["images"])
-        if row["role"] == "unassigned" and row["shape"] == SHAPE and row["sd_col_px"] is not None and "foreign-mark" not in (row["flags"] or "")
+        if row["role"] == "unassigned"
+        and row["shape"] == SHAPE
+        and row["sd_col_px"] is not None
+        and "foreign-mark" not in (row["flags"] or "")
     ]
     parts = [_rays(focus, rows["images"], [i for i in free if rows["images"][i]["focus"] in (0, focus["focus"])]) for focus in rows["foci"]]
-    return RayBundle(*(np.concatenate(column) for column in zip(*parts, strict=True))) if parts else _no_rays()
+    return joined_rays([_no_rays(), *parts])
 
 
 def _no_rays() -> RayBundle:
@@ -48,19 +51,17 @@ def _no_rays() -> RayBundle:
     return RayBundle(none, none, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6, 6)), np.zeros((0, 6, 0)))
 
 
-def _rays(focus: Row, images: Sequence[Row], free: Sequence[int]) -> tuple[Float, ...]:
-    nothing = _no_rays()
-    empty = (nothing.image, nothing.focus, nothing.origin_mm, nothing.through_mm, nothing.covariance_mm2, nothing.cage_effect_mm)
+def _rays(focus: Row, images: Sequence[Row], free: Sequence[int]) -> RayBundle:
     known = [row for row in images if row["focus"] == focus["focus"] and row["role"] == "fiducial" and row["x_mm"] is not None]
     if not free or len(known) < LEAST_MARKS or focus["x_mm"] is None:
-        return empty
+        return _no_rays()
     places = np.array([[row["x_mm"], row["y_mm"], row["z_mm"]] for row in known])
     middle = places.mean(axis=0)
     basis = np.linalg.svd(places - middle)[2][:2]
     try:
         plane_from_film = fit_homography(np.array([[row["col_px"], row["row_px"]] for row in known]), (places - middle) @ basis.T)
     except GeometryError:
-        return empty
+        return _no_rays()
     n = len(free)
     px = np.array([[images[i]["col_px"], images[i]["row_px"]] for i in free])
     sd = np.array([[images[i]["sd_col_px"], images[i]["sd_row_px"]] for i in free])
@@ -72,4 +73,4 @@ def _rays(focus: Row, images: Sequence[Row], free: Sequence[int]) -> tuple[Float
     covariance[:, 3:, 3:] = np.diag([(focus[f"sd_{axis}_mm"] or 0.0) ** 2 for axis in "xyz"])
     through = middle + apply_homography(plane_from_film, px) @ basis
     origin = np.tile([focus[f"{axis}_mm"] for axis in "xyz"], (n, 1))
-    return np.array(free, np.int64), np.full(n, focus["focus"], np.int64), origin, through, covariance, np.zeros((n, 6, 0))
+    return RayBundle(np.array(free, np.int64), np.full(n, focus["focus"], np.int64), origin, through, covariance, np.zeros((n, 6, 0)))

@@ -13,8 +13,9 @@ from typing import Final
 import numpy as np
 from scipy.special import gammaln
 
+from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.packing import pack
-from rsa_vision.identify.poses import GATE, LEAST_POINTS, Cloud, Pairs, Placement, candidate_poses, disjoint, nearness, place, volume_mm3
+from rsa_vision.identify.poses import GATE, Cloud, Pairs, Placement, candidate_poses, disjoint, nearness, place, volume_mm3
 from rsa_vision.types import Bool, Float, Int
 
 FOUND: Final = 0.9  # probability that a marker of a known segment is among the points

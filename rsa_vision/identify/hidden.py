@@ -21,8 +21,6 @@ from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import (
     GATE,
     GATE_SCALE,
-    ROTATION_RAD,
-    SCALE_PRIOR,
     SCALES,
     TOLERANCE_MM,
     Cloud,
@@ -30,15 +28,14 @@ from rsa_vision.identify.poses import (
     Placement,
     distances,
     nearness,
-    pose_jacobian,
     rotation_by,
 )
-from rsa_vision.types import Float
+from rsa_vision.identify.ray_poses import off_rays, place_with_rays
+from rsa_vision.types import Bool, Float
 
 TURNS: Final = 90  # poses tried around the line through two known places
 COARSE_MM: Final = 3.0  # how near a ray must come to be tried then
 GRAZING_MM: Final = 0.5  # by which a ray may miss the sphere on which its marker lies
-STEPS: Final = 6
 MOST_TRIED: Final = 150
 
 
@@ -80,59 +77,6 @@ class _Scene:
         return float(np.log(self.volume / self.stray)), float(np.log(area / (STRAY + len(self.rays))))
 
 
-def place_with_rays(
-    body: Cloud, points: Cloud, pairs: Pairs, rays: RayBundle, sights: Pairs, rotation: Float, translation: Float
-) -> Placement | None:
-    """Fit the pose of a body to points and rays of its markers.
-
-    Parameters
-    ----------
-    body, points : Cloud
-    pairs : tuple of (marker, point)
-    rays : RayBundle
-    sights : tuple of (marker, ray)
-    rotation, translation : ndarray of shape (3, 3) and (3,)
-        To begin with.
-
-    Returns
-    -------
-    Placement or None
-        Its ``sigmas`` are of `pairs`, then of `sights`. None where the iteration does not settle.
-
-    Notes
-    -----
-    Gauss and Newton's method on ``Σ rᵀ S⁻¹ r``: r the difference of point and marker, or its two components across the ray.
-    """
-    mine = np.array([i for i, _ in (*pairs, *sights)])
-    theirs, seen = [a for _, a in pairs], [r for _, r in sights]
-    across = _across(rays.direction[seen])
-    length = np.linalg.norm(rays.origin_mm - rays.through_mm, axis=1)[seen]
-    for _ in range(STEPS):
-        moved = body.position_mm[mine] @ rotation.T + translation
-        centre = moved.mean(axis=0)
-        jacobian = pose_jacobian(moved - centre)
-        own = rotation @ body.covariance_mm2[mine] @ rotation.T
-        k = len(pairs)
-        target = rays.through_mm[seen]
-        up = ((moved[k:] - target) * -rays.direction[seen]).sum(-1) / length
-        at_ray = _ray_covariance(rays.covariance_mm2[seen], up)
-        residual = [*(points.position_mm[theirs] - moved[:k]), *np.einsum("nij,nj->ni", across, target - moved[k:])]
-        design = [*jacobian[:k], *(across @ jacobian[k:])]
-        stated = [*(points.covariance_mm2[theirs] + own[:k]), *(across @ (at_ray + own[k:]) @ across.swapaxes(1, 2))]
-        step, normal, _, _ = _solved(residual, design, stated, 1.0)
-        turn = rotation_by(step[:3])
-        rotation, translation = turn @ rotation, turn @ (translation - centre) + centre + step[3:]
-        if np.linalg.norm(step) < 1e-6:
-            break
-        if not np.linalg.norm(step[:3]) < 1.0:
-            return None
-    solved = [_solved(residual, design, stated, scale) for scale in SCALES]
-    log_likelihood = np.array([density + 3 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(normal)[1] for _, normal, density, _ in solved])
-    best = int(np.argmax(log_likelihood + np.log(SCALE_PRIOR)))
-    total = float(logsumexp(log_likelihood, b=SCALE_PRIOR))
-    return Placement(rotation, translation, centre, np.linalg.inv(solved[best][1]), total, solved[0][3])
-
-
 def hidden_markers(
     body: Cloud,
     points: Cloud,
@@ -165,7 +109,7 @@ def hidden_markers(
         ``decisive`` is False where a ray may be of a missing marker, but not decisively.
     """
     scene = _Scene(body, points, rays, volume, STRAY)
-    away, log_density = _off_rays(body, rays, placement)
+    away, log_density = off_rays(body, rays, placement)
     marker, ray = np.nonzero(away < GATE)
     tried = [(int(i), int(r)) for i, r in zip(marker, ray, strict=True) if i in missing]
     if not tried:
@@ -198,8 +142,8 @@ def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, p
 
     Notes
     -----
-    Two places begin a hypothesis: points of two markers with their distance, or a point and where a ray pierces the sphere about it on which
-    another marker must lie. Around the line through both the body is turned, and every pose at which a third marker meets a ray is fitted
+    Two places begin a hypothesis: points of two markers with their distance, or a point and where a ray pierces the sphere about it on
+    which another marker must lie. The body is turned about the line through both, and where a third marker meets a ray its pose is fitted
     and grown.
     """
     scene = _Scene(body, points, rays, volume, STRAY + len(points))
@@ -209,7 +153,9 @@ def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, p
         if (grown := _grown(scene, start)) is not None:
             kept, seen, placement = grown
             same = found.setdefault((kept, seen), [])
-            if all(np.linalg.norm(placement.predict(body.position_mm)[0] - p.predict(body.position_mm)[0], axis=1).max() > 1.0 for p in same):
+            if all(
+                np.linalg.norm(placement.predict(body.position_mm)[0] - p.predict(body.position_mm)[0], axis=1).max() > 1.0 for p in same
+            ):
                 same.append(placement)
     every = [(_log_odds(scene, *key, placement), key, placement) for key, placements in found.items() for placement in placements]
     every = sorted((one for one in every if one[0] > NEGLIGIBLE), key=lambda one: (-one[0], one[1]))
@@ -323,7 +269,7 @@ def _met(scene: _Scene, placement: Placement) -> tuple[Pairs, Pairs]:
     for i, a in _ranked(away, away < GATE):
         if i not in pairs and a not in pairs.values():
             pairs[i] = a
-    off, _ = _off_rays(scene.body, scene.rays, placement)
+    off, _ = off_rays(scene.body, scene.rays, placement)
     for i, r in _ranked(off, off < GATE):
         seen = (i, int(scene.rays.focus[r]))
         if i not in pairs and seen not in sights and scene.rays.image[r] not in {scene.rays.image[x] for x in sights.values()}:
@@ -335,48 +281,3 @@ def _ranked(cost: Float, possible: Bool) -> list[tuple[int, int]]:
     first, second = np.nonzero(possible)
     order = np.argsort(cost[first, second], kind="stable")
     return [(int(first[o]), int(second[o])) for o in order]
-
-
-def _off_rays(body: Cloud, rays: RayBundle, placement: Placement) -> tuple[Float, Float]:
-    """Return how far rays pass markers at a pose, shape (n, r), in units of sd, and the log density (1/mm²) of passing like that."""
-    moved, by_pose = placement.predict(body.position_mm)
-    own = placement.rotation @ body.covariance_mm2 @ placement.rotation.T
-    across = _across(rays.direction)  # (r, 2, 3)
-    offset = np.einsum("rij,nrj->nri", across, rays.through_mm - moved[:, None])
-    length = np.linalg.norm(rays.origin_mm - rays.through_mm, axis=1)
-    up = ((moved[:, None] - rays.through_mm) * -rays.direction).sum(-1) / length
-    at_ray = np.stack([_ray_covariance(rays.covariance_mm2, row) for row in up])
-    stated = GATE_SCALE**2 * (at_ray + own[:, None]) + by_pose[:, None] + TOLERANCE_MM**2 * np.eye(3)
-    covariance = across @ stated @ across.swapaxes(-1, -2)
-    squares = (offset * np.linalg.solve(covariance, offset[..., None])[..., 0]).sum(-1)
-    return np.sqrt(squares), -0.5 * squares - np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(covariance)[1]
-
-
-def _ray_covariance(covariance: Float, up: Float) -> Float:
-    """Return the covariance of places on rays, a fraction of the way up from the plane to the focus; shapes (n, 6, 6), (n,)."""
-    lever = np.concatenate([(1 - up)[:, None, None] * np.eye(3), up[:, None, None] * np.eye(3)], axis=2)
-    result: Float = lever @ covariance @ lever.swapaxes(1, 2)
-    return result
-
-
-def _across(direction: Float) -> Float:
-    """Return two unit vectors perpendicular to each direction, shape (n, 2, 3)."""
-    helper = np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]) if len(direction) else np.zeros((0, 3))
-    first = np.cross(direction, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(direction, first)], axis=1)
-
-
-def _solved(residual: list[Float], design: list[Float], stated: list[Float], scale: float) -> tuple[Float, Float, float, Float]:
-    """Return the step, the normal matrix, the log density after it, and the residuals in units of their sd."""
-    normal = np.diag([ROTATION_RAD**-2 * 1e-3] * 3 + [0.0] * 3)
-    right = np.zeros(6)
-    weights = [np.linalg.inv(scale**2 * s + TOLERANCE_MM**2 * np.eye(len(s))) for s in stated]
-    for r, d, w in zip(residual, design, weights, strict=True):
-        normal += d.T @ w @ d
-        right += d.T @ w @ r
-    step = np.linalg.solve(normal, right)
-    left = [r - d @ step for r, d in zip(residual, design, strict=True)]
-    squares = np.array([r @ w @ r for r, w in zip(left, weights, strict=True)])
-    density = sum(-0.5 * q - 0.5 * len(r) * np.log(2 * np.pi) + 0.5 * np.linalg.slogdet(w)[1] for q, r, w in zip(squares, left, weights, strict=True))
-    return step, normal, float(density), np.sqrt(squares / [len(r) for r in left])
