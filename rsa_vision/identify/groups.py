@@ -50,18 +50,16 @@ def rigid_groups(exams: Sequence[Cloud]) -> list[Group]:
     Notes
     -----
     The change Δ of a distance since the first examination that shows both markers, of variance v by the markers' errors and the tolerance,
-    speaks for one body with ``Σ log N(Δ; v) − log N(Δ; v + MOVED²)``. Groups are merged while every pair of both speaks for it, the surest
-    first (complete linkage).
+    speaks for one body with ``Σ log N(Δ; v) − log N(Δ; v + MOVED²)``. The largest set of which every pair speaks for it is a group (of
+    equally large ones that with the largest sum), then the largest of the rest.
     """
     odds, changes = _log_odds(exams)
-    groups = [[i] for i in range(len(odds))]
-    while len(groups) > 1:
-        links = [(float(odds[np.ix_(a, b)].min()), p, q) for p, a in enumerate(groups) for q, b in enumerate(groups) if p < q]
-        best, p, q = max(links, key=lambda link: (link[0], -link[1], -link[2]))
-        if best <= 0:
-            break
-        groups[p] = sorted(groups[p] + groups[q])
-        del groups[q]
+    groups: list[list[int]] = []
+    left = list(range(len(odds)))
+    while left:
+        grown = [_grown(odds, start, left) for start in left]
+        groups.append(max(grown, key=lambda group: (len(group), float(odds[np.ix_(group, group)].sum()), [-i for i in group])))
+        left = [i for i in left if i not in groups[-1]]
     result = []
     for members in sorted(groups):
         rest = np.setdiff1d(np.arange(len(odds)), members)
@@ -73,6 +71,16 @@ def rigid_groups(exams: Sequence[Cloud]) -> list[Group]:
         change = float(1000 * np.sqrt((known**2).mean())) if len(known) else 0.0
         result.append(Group(tuple(members), float(1 / (1 + np.exp(-doubt))), change))
     return result
+
+
+def _grown(odds: Float, start: int, left: Sequence[int]) -> list[int]:
+    """Return the group about a marker: in the largest company first, as long as every pair speaks for one body."""
+    group, others = [start], [i for i in left if i != start and odds[start, i] > 0]
+    while others:
+        company = [(sum(odds[i, j] > 0 for j in others), float(odds[i, group].min()), -i) for i in others]
+        group.append(others[company.index(max(company))])
+        others = [i for i in others if i not in group and odds[i, group].min() > 0]
+    return sorted(group)
 
 
 def _log_odds(exams: Sequence[Cloud]) -> tuple[Float, Float]:

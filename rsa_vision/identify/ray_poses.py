@@ -75,7 +75,7 @@ def place_with_rays(
     log_likelihood = np.array([density + 3 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(normal)[1] for _, normal, density, _ in solved])
     best = int(np.argmax(log_likelihood + np.log(SCALE_PRIOR)))
     total = float(logsumexp(log_likelihood, b=SCALE_PRIOR))
-    covariance: Float = np.linalg.inv(solved[best][1])
+    covariance = np.asarray(np.linalg.inv(solved[best][1]), np.float64)
     return Placement(rotation, translation, centre, covariance, total, solved[0][3])
 
 
@@ -118,7 +118,7 @@ def _solved(residual: list[Float], design: list[Float], stated: list[Float], sca
     for r, d, w in zip(residual, design, weights, strict=True):
         normal += d.T @ w @ d
         right += d.T @ w @ r
-    step: Float = np.linalg.solve(normal, right)
+    step = np.asarray(np.linalg.solve(normal, right), np.float64)
     left = [r - d @ step for r, d in zip(residual, design, strict=True)]
     squares = np.array([r @ w @ r for r, w in zip(left, weights, strict=True)])
     density = sum(
