@@ -32,7 +32,15 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study")
     box = np.array([[-25.0, 40, 60], [45, 130, 140]])
     make_study(
-        folder, "2", rng=np.random.default_rng(5), n_exams=3, segments={"bone": 6, "implant": 5}, box_mm=box, pitch_mm=0.15, fine=1, quanta=None
+        folder,
+        "2",
+        rng=np.random.default_rng(5),
+        n_exams=3,
+        segments={"bone": 6, "implant": 5},
+        box_mm=box,
+        pitch_mm=0.15,
+        fine=1,
+        quanta=None,
     )
     return folder
 
@@ -170,7 +178,10 @@ HEAD = "subject,segment,marker,x_mm,y_mm,z_mm\n"
     [
         ("subject,segment,x_mm,y_mm,z_mm\n", ["marker is missing"]),
         (HEAD, ["no marker"]),
-        (HEAD + "S,a,1,0,0,zero\nS,a,1,nan,0,0\n,b/c,,0,0,0\nS,a\n", ["line 2: z_mm", "line 3: x_mm", "stands there", "slash", "marker is empty", "2 values"]),
+        (
+            HEAD + "S,a,1,0,0,zero\nS,a,1,nan,0,0\n,b/c,,0,0,0\nS,a\n",
+            ["line 2: z_mm", "line 3: x_mm", "stands there", "slash", "marker is empty", "2 values"],
+        ),
         (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\n", ["2 markers"]),
         (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\nS,a,3,20,0,0.1\n", ["in line"]),
         (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\nS,a,3,0,20,0\nS,a,4,0,20,0.1\n", ["same place"]),

@@ -73,6 +73,8 @@ def test_a_symmetric_body_has_more_than_one_pose() -> None:
     rng = np.random.default_rng(9)
     square = np.array([[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0.0]])
     places = square + [0, 100, 150.0]
-    found = find_with_rays(Cloud.exact(square), measured(rng, places[:2], 0.01), seen_from(rng, places[2:], np.array([0, 1])), 1e5, POSTERIOR)
+    found = find_with_rays(
+        Cloud.exact(square), measured(rng, places[:2], 0.01), seen_from(rng, places[2:], np.array([0, 1])), 1e5, POSTERIOR
+    )
     assert found.placement is not None
     assert not found.decisive
