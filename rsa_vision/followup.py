@@ -126,6 +126,11 @@ def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) 
         exam.findings += _segment_findings(segment, replace(known, lost=lost), sighting, limits)
         if sighting.placement is not None:
             exam.hidden += _hidden(segment, sighting, exam)
+    if "pair-ambiguous" in exam.rows["exams"][0]["reasons"].split(";"):
+        doubted = [a for a, row in enumerate(exam.located) if flag_value(row["flags"] or "") & MarkerFlag.AMBIGUOUS]
+        agreed = [exam.names[a] for a in doubted if exam.names[a] and not exam.flags[a]]
+        if agreed:
+            exam.findings.append(("pair-ambiguous", f"the doubtful pairs of {', '.join(agreed)} agree with the constellation"))
     extra = [_name(row) for row, name in zip(exam.located, exam.names, strict=True) if not name]
     if extra:
         exam.findings.append(("marker-mismatch", f"{len(extra)} markers belong to no known segment"))

@@ -13,7 +13,10 @@ import pytest
 import rsa_vision
 from rsa_vision.cli import run_app
 from rsa_vision.errors import SettingsError
-from rsa_vision.segments import read_segments
+from rsa_vision.followup import follow_up
+from rsa_vision.segments import Segment, read_segments
+from rsa_vision.settings import Limits
+from rsa_vision.tables import SCHEMAS
 from rsa_vision.types import MarkerImages
 from synthetic.study import make_study
 from tests.cli.conftest import SD_PX, content
@@ -89,8 +92,7 @@ def names_of_truth(films: Path, out: Path) -> dict[str, dict[str, str]]:
     for exam in (FIRST, SECOND, THIRD):
         true = places(truth, exam)
         result[exam] = {
-            name: min(true, key=lambda t: float(np.linalg.norm(true[t] - place)))  # noqa: B023
-            for name, place in places(found, exam).items()
+            name: min(true, key=lambda t: float(np.linalg.norm(true[t] - place))) for name, place in places(found, exam).items()
         }
     return result
 
@@ -157,6 +159,42 @@ def test_segments_of_another_object_are_never_ok(films: Path, hide: Any, tmp_pat
     table.write_csv(tmp_path / "mirrored.csv")
     assert run_app(["measure", str(films), "-o", str(tmp_path / "out"), "--segments", str(tmp_path / "mirrored.csv")]) == 1
     assert all(status == "review" and "marker-mismatch" in reasons for status, reasons in exams(tmp_path / "out").values())
+
+
+def rows_of(exam: str, places_mm: np.ndarray, flags: str = "", reasons: str = "") -> Any:
+    """The tables of an examination with markers at places, without images."""
+    markers = [
+        dict.fromkeys(SCHEMAS["markers"])
+        | {"subject": "S", "exam": exam, "segment": "", "marker": f"P{k + 1:02d}", "n_views": 2, "flags": flags}
+        | dict(zip(("x_mm", "y_mm", "z_mm"), place.tolist(), strict=True))
+        | {f"sd_{axis}_mm": 0.01 for axis in "xyz"}
+        for k, place in enumerate(places_mm)
+    ]
+    about = {"subject": "S", "exam": exam, "status": "review" if reasons else "ok", "reasons": reasons, "message": ""}
+    return {"exams": [about], "images": [], "foci": [], "markers": markers}
+
+
+def test_names_given_twice_are_the_same_and_too_few_markers_are_never_named() -> None:
+    body = np.random.default_rng(1).normal(0, 20, (6, 3))
+    exams = [rows_of("1", body), rows_of("2", body[[4, 1]] + 3), rows_of("3", body[:0]), rows_of("4", body[::-1] - 5)]
+    for segments in (None, {"": [Segment("a", tuple("123456"), body)]}):
+        once = follow_up(exams, segments, Limits())
+        twice = follow_up(once, segments, Limits())
+        assert [rows["markers"] for rows in twice] == [rows["markers"] for rows in once]
+        first, few, none, last = once
+        assert first["exams"][0]["status"] == last["exams"][0]["status"] == "ok"
+        assert [row["marker"] for row in last["markers"]] == [row["marker"] for row in first["markers"]][::-1]
+        assert few["exams"][0]["status"] == "review"
+        assert not {row["marker"] for row in few["markers"]} & {row["marker"] for row in first["markers"]}
+        assert none["markers"] == []
+
+
+def test_doubtful_pairs_that_agree_with_the_segment_stay_in_review_and_it_says_so() -> None:
+    body = np.random.default_rng(2).normal(0, 20, (5, 3))
+    (named,) = follow_up([rows_of("1", body + 9, "ambiguous", "pair-ambiguous")], {"S": [Segment("a", tuple("12345"), body)]}, Limits())
+    assert (named["exams"][0]["status"], named["exams"][0]["reasons"]) == ("review", "pair-ambiguous")
+    assert "agree with the constellation" in named["exams"][0]["message"]
+    assert all(row["segment"] == "a" for row in named["markers"])
 
 
 def test_reconstruct_names_points_by_segments(films: Path, tmp_path: Path) -> None:

@@ -55,14 +55,14 @@ def examination(
     places, truth = [], []
     for index, body in enumerate(bodies):
         shape = body * [-1, 1, 1] if mirrored else body
-        moved = Rotation.random(random_state=rng).apply(shape) + rng.normal(0, 15, 3) + [0, 40 * index, 100]
+        moved = Rotation.random(random_state=rng).apply(shape) + rng.normal(0, 15, 3) + np.array([0, 40 * index, 100])
         for marker, place in enumerate(moved):
             fate = rng.random()
             if fate >= lost:
                 places.append(place + rng.normal(0, RIGID_MM, 3) + (rng.normal(0, 0.7, 3) if fate > 1 - loose else 0))
                 truth.append((index, marker))
     for _ in range(rng.poisson(strays)):
-        places.append(rng.normal(0, 20, 3) + [0, 20, 100])
+        places.append(rng.normal(0, 20, 3) + np.array([0, 20, 100]))
         truth.append(STRAY)
     order = rng.permutation(len(places))
     return Found(measured(rng, np.array(places).reshape(-1, 3)[order], sd_mm), [truth[k] for k in order])

@@ -90,7 +90,7 @@ def test_markers_that_could_be_exchanged_within_the_noise_have_no_names() -> Non
 def test_a_loose_marker_keeps_its_name_with_a_warning_and_a_lost_one_is_listed() -> None:
     rng = np.random.default_rng(3)
     body = random_body(rng, 7)
-    moved = body + [5.0, 0, 100]
+    moved = body + np.array([5.0, 0, 100])
     moved[2] += [0.9, 0.9, 0]
     (known,) = match_segments([Cloud.exact(body)], measured(rng, moved[:6], 0.01), POSTERIOR)
     assert {pair[0] for pair in known.loose} == {2}
@@ -114,7 +114,7 @@ def test_bodies_that_moved_against_each_other_are_found_again_without_knowing_th
     for _ in range(15):
         before, after, names = [], [], []
         for index, n in enumerate(sizes):
-            body = random_body(rng, n) + [0, 40 * index, 100]
+            body = random_body(rng, n) + np.array([0, 40 * index, 100])
             far = rng.random() < 0.3
             turn = Rotation.from_rotvec(rng.normal(0, 0.5 if far else 0.02, 3))
             before.append(body)
@@ -124,7 +124,7 @@ def test_bodies_that_moved_against_each_other_are_found_again_without_knowing_th
         there, here = rng.random(len(names)) > 0.06, rng.random(len(names)) > 0.06
         old = [name for name, is_there in zip(names, there, strict=True) if is_there]
         new = [name for name, is_here in zip(names, here, strict=True) if is_here] + [STRAY]
-        second = np.concatenate([second[here], rng.normal(0, 20, (1, 3)) + [0, 20, 100]])
+        second = np.concatenate([second[here], rng.normal(0, 20, (1, 3)) + np.array([0, 20, 100])])
         sd = float(rng.choice([0.001, 0.02, 0.05]))
         bodies, doubtful = match_bodies(measured(rng, first[there], sd), measured(rng, second, sd), POSTERIOR)
         pairs = [pair for body in bodies for pair in body]
@@ -154,7 +154,7 @@ def test_the_stated_covariance_of_a_pose_is_that_of_its_errors() -> None:
 
 def test_groups_that_move_are_told_apart_and_groups_that_do_not_are_one() -> None:
     rng = np.random.default_rng(7)
-    a, b = random_body(rng, 5), random_body(rng, 4) + [0, 60, 0]
+    a, b = random_body(rng, 5), random_body(rng, 4) + np.array([0, 60, 0])
     turned = Rotation.from_rotvec([0.05, 0, 0.05]).apply(b - b.mean(0)) + b.mean(0) + [1.0, 1.5, 0]
     still, moved = np.concatenate([a, b]), np.concatenate([a, turned])
     exams = [measured(rng, places, 0.02) for places in (still, moved, still + 3.0)]

@@ -1,4 +1,4 @@
-"""Markers that one focus alone shows: found among single rays, with true stated errors, and never at a wrong pose that counts as decisive."""
+"""Markers that one focus alone shows: found among single rays with true stated errors, never decisive at a wrong pose."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_what_does_not_determine_a_pose_is_not_decisive() -> None:
 def test_a_symmetric_body_has_more_than_one_pose() -> None:
     rng = np.random.default_rng(9)
     square = np.array([[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0.0]])
-    places = square + [0, 100, 150.0]
+    places = square + np.array([0, 100, 150.0])
     found = find_with_rays(
         Cloud.exact(square), measured(rng, places[:2], 0.01), seen_from(rng, places[2:], np.array([0, 1])), 1e5, POSTERIOR
     )
