@@ -51,7 +51,8 @@ def rigid_groups(exams: Sequence[Cloud]) -> list[Group]:
     -----
     The change Δ of a distance since the first examination that shows both markers, of variance v by the markers' errors and the tolerance,
     speaks for one body with ``Σ log N(Δ; v) − log N(Δ; v + MOVED²)``. The largest set of which every pair speaks for it is a group (of
-    equally large ones that with the largest sum), then the largest of the rest.
+    equally large ones that with the largest sum), then the largest of the rest. At last each marker goes to
+    the group that it fits best on average.
     """
     odds, changes = _log_odds(exams)
     groups: list[list[int]] = []
@@ -60,6 +61,7 @@ def rigid_groups(exams: Sequence[Cloud]) -> list[Group]:
         grown = [_grown(odds, start, left) for start in left]
         groups.append(max(grown, key=lambda group: (len(group), float(odds[np.ix_(group, group)].sum()), [-i for i in group])))
         left = [i for i in left if i not in groups[-1]]
+    groups = _settled(odds, groups)
     result = []
     for members in sorted(groups):
         rest = np.setdiff1d(np.arange(len(odds)), members)
@@ -81,6 +83,21 @@ def _grown(odds: Float, start: int, left: Sequence[int]) -> list[int]:
         group.append(others[company.index(max(company))])
         others = [i for i in others if i not in group and odds[i, group].min() > 0]
     return sorted(group)
+
+
+def _settled(odds: Float, groups: list[list[int]]) -> list[list[int]]:
+    """Return the groups after markers have gone to where they fit best: one near two bodies may have been taken by the wrong one."""
+    for _ in range(len(odds)):
+        for i, mine in ((i, group) for group in groups for i in group):
+            homes = [group for group in groups if len(set(group) - {i}) >= SMALLEST - 1 and odds[i, [j for j in group if j != i]].min() > 0]
+            best = max(homes, key=lambda group: float(odds[i, [j for j in group if j != i]].mean()), default=mine)
+            if best is not mine:
+                groups = [sorted({*group, i}) if group is best else [j for j in group if j != i] for group in groups]
+                groups = [group for group in groups if group]
+                break
+        else:
+            break
+    return groups
 
 
 def _log_odds(exams: Sequence[Cloud]) -> tuple[Float, Float]:
