@@ -15,6 +15,8 @@ _COMMANDS: Final = frozenset({"measure", "detect", "reconstruct", "report", "dem
 _LAZY: Final = {
     **dict.fromkeys(_COMMANDS, "rsa_vision.api"),
     "Summary": "rsa_vision.api",
+    "propose_segments": "rsa_vision.api",
+    "read_segments": "rsa_vision.segments",
     "Cage": "rsa_vision.cages",
     "load_cage": "rsa_vision.cages",
     "builtin_cages": "rsa_vision.cages",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
@@ -13,12 +13,15 @@ from rsa_vision.batch import Outcome, Task, run
 from rsa_vision.errors import FilmError, UsageError
 from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
 from rsa_vision.provenance import environment, file_sha256
+from rsa_vision.segments import Segments, read_segments
 from rsa_vision.settings import Study
 from rsa_vision.store import to_csv, write_atomic, write_run, write_tables
 from rsa_vision.study_files import natural_key
 
 if TYPE_CHECKING:
     import polars as pl
+
+    from rsa_vision.proposal import Proposal
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +81,7 @@ def measure(
     study : path, optional
         Study file; default: ``study.toml`` in the folder, if there is one.
     segments : path, optional
-        Refused until markers are matched with known segments.
+        CSV file of the known segments; without it markers are named P01, P02, ... and keep their names through a subject's examinations.
     method : str
         ``selvik``.
     jobs : int
@@ -106,7 +109,8 @@ def measure(
     """
     started = datetime.now(UTC)
     folder, out = Path(folder), Path(out)
-    refuse_unbuilt(method, segments, dask, jobs, timeout_s)
+    refuse_unbuilt(method, dask, jobs, timeout_s)
+    known = read_segments(Path(segments)) if segments is not None else None
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of the films")
     study_file = Path(study) if study is not None else default_study(folder)
@@ -117,8 +121,9 @@ def measure(
     depends_on = {"settings": _described(settled), "geometry": about, "method": method}
     tasks = [Task(files, settled, geometry, depends_on, out, redo) for files in grouping.exams]
     outcomes = run(tasks, jobs, timeout_s, lambda outcome: watch(outcome, len(tasks)) if watch else None)
+    outcomes = _followed_up(outcomes, known, settled)
     write_tables(out, (outcome.rows for outcome in outcomes))
-    options = {"method": method, "jobs": jobs, "redo": redo, "timeout_s": timeout_s}
+    options = {"method": method, "segments": _hashed(segments), "jobs": jobs, "redo": redo, "timeout_s": timeout_s}
     record = _record("measure", started, folder, study_file, settled, about) | {
         "options": options,
         "inputs": [
@@ -138,7 +143,13 @@ def measure(
 
 
 def reconstruct(
-    points: str | Path, out: str | Path, *, cage: str | Path | None = None, study: str | Path | None = None, **settings: Any
+    points: str | Path,
+    out: str | Path,
+    *,
+    cage: str | Path | None = None,
+    study: str | Path | None = None,
+    segments: str | Path | None = None,
+    **settings: Any,
 ) -> Summary:
     """Reconstruct markers from image coordinates that were measured elsewhere.
 
@@ -151,6 +162,8 @@ def reconstruct(
     cage : str or path
         Name or file of a cage; default: the study's.
     study : path, optional
+    segments : path, optional
+        CSV file of the known segments, by which the markers are named; without it they keep the names that they have.
     **settings
         As of :func:`measure`.
 
@@ -161,7 +174,7 @@ def reconstruct(
     Raises
     ------
     RsaError
-        If the points, the cage or the study cannot be read, or results cannot be written.
+        If the points, the cage, the study or the segments cannot be read, or results cannot be written.
     """
     from rsa_vision.cages import load_cage
     from rsa_vision.examination import reconstruct_points
@@ -174,6 +187,7 @@ def reconstruct(
     settled = settle(study_file, {"cage": cage, **settings})
     if settled.cage is None:
         raise UsageError("points are reconstructed with a cage; give it with --cage (see `rsa-vision cage list`)")
+    known = read_segments(Path(segments)) if segments is not None else None
     loaded = load_cage(settled.cage)
     exams = read_points(points, loaded)
     _prepare(out)
@@ -183,9 +197,12 @@ def reconstruct(
         result = reconstruct_points(table, settled, loaded)
         rows = examination_rows(subject, exam, [points.name], result, perf_counter() - began)
         outcomes.append(Outcome(subject, exam, rows))
+    if known is not None:  # names that somebody gave stand unless the segments are to give them
+        outcomes = _followed_up(outcomes, known, settled)
     write_tables(out, (outcome.rows for outcome in outcomes))
     record = _record("reconstruct", started, points, study_file, settled, {"cage": cage_content(loaded)})
-    _finish(out, record | {"inputs": [{"path": str(points.resolve()), "sha256": file_sha256(points)}]})
+    inputs = [{"path": str(points.resolve()), "sha256": file_sha256(points)}]
+    _finish(out, record | {"options": {"segments": _hashed(segments)}, "inputs": inputs})
     return Summary(out, tuple(outcomes))
 
 
@@ -266,6 +283,40 @@ def report(out: str | Path) -> Path:
     return write_report(Path(out))
 
 
+def propose_segments(results: str | Path, out: str | Path | None = None) -> list[Proposal]:
+    """Suggest rigid groups of markers from several examinations; the command ``segments propose``.
+
+    Parameters
+    ----------
+    results : path
+        Folder of results, or its ``markers.csv``.
+    out : path, optional
+        ``segments.csv`` to write.
+
+    Returns
+    -------
+    list of Proposal
+        With a figure of how sure each is. Bodies that did not move against each other look like one.
+
+    Raises
+    ------
+    UsageError
+        If there are no results, no subject has two examinations, no group is found, or the file cannot be written.
+    """
+    from rsa_vision.proposal import propose
+    from rsa_vision.segments import segments_csv
+    from rsa_vision.store import read_tables
+
+    path = Path(results)
+    proposals, _ = propose(read_tables(path if path.is_dir() else path.parent)["markers"].to_dicts())
+    if not proposals:
+        raise UsageError(f"{path}: no three markers keep their distances in two examinations of a subject; measure more examinations")
+    if out is not None:
+        by_subject = {p.subject: [q.segment for q in proposals if q.subject == p.subject] for p in proposals}
+        write_atomic(Path(out), segments_csv(by_subject.items()).encode())
+    return proposals
+
+
 def demo(folder: str | Path = "rsa-vision-demo", *, seed: int = 1, watch: Watcher | None = None) -> list[Summary]:
     """Make a small study of synthetic films with the cages 1A, 1B and 2, and measure it.
 
@@ -297,6 +348,17 @@ def demo(folder: str | Path = "rsa-vision-demo", *, seed: int = 1, watch: Watche
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from error
     return [measure(study, study / "results", watch=watch) for study in studies]
+
+
+def _followed_up(outcomes: Sequence[Outcome], segments: Segments | None, study: Study) -> list[Outcome]:
+    from rsa_vision.followup import follow_up
+
+    every = follow_up([outcome.rows for outcome in outcomes], segments, study.limits)
+    return [replace(outcome, rows=rows) for outcome, rows in zip(outcomes, every, strict=True)]
+
+
+def _hashed(path: str | Path | None) -> dict[str, str] | None:
+    return {"path": str(Path(path).resolve()), "sha256": file_sha256(Path(path))} if path is not None else None
 
 
 def _prepare(out: Path) -> None:

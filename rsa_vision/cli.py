@@ -25,6 +25,8 @@ app = typer.Typer(
 )
 cage_app = typer.Typer(help="Built-in cages, drawings of cages, checks of cage files.", no_args_is_help=True)
 app.add_typer(cage_app, name="cage")
+segments_app = typer.Typer(help="Known segments.", no_args_is_help=True)
+app.add_typer(segments_app, name="segments")
 
 INTERRUPTED = 130  # as shells report Ctrl-C
 Result = TypeVar("Result")
@@ -88,7 +90,7 @@ def measure(
     out: Out,
     cage: CageOption = None,
     study: Annotated[Path | None, typer.Option("--study", help="Study file; default: study.toml in FOLDER, if there.")] = None,
-    segments: Annotated[Path | None, typer.Option("--segments", help="Known segments (refused until built).")] = None,
+    segments: Annotated[Path | None, typer.Option("--segments", help="CSV file of the known segments.")] = None,
     method: Annotated[str, typer.Option("--method", help="selvik (bundle is refused until built).")] = "selvik",
     jobs: Annotated[int, typer.Option("--jobs", "-j", help="Number of processes.")] = 1,
     dask: Annotated[str | None, typer.Option("--dask", help="Address of a scheduler (refused until built).")] = None,
@@ -163,11 +165,12 @@ def reconstruct(
     out: Out,
     cage: CageOption = None,
     study: StudyOption = None,
+    segments: Annotated[Path | None, typer.Option("--segments", help="CSV file of the known segments, to name the markers by.")] = None,
 ) -> int:
     """Reconstruct markers from image coordinates that were measured elsewhere."""
     from rsa_vision import api
 
-    summary = api.reconstruct(points, out, cage=cage, study=study)
+    summary = api.reconstruct(points, out, cage=cage, study=study, segments=segments)
     _print_summary(summary)
     return summary.exit_code
 
@@ -236,6 +239,20 @@ def cage_check(file: Annotated[str, typer.Argument(metavar="FILE", help="Cage fi
 
     cage = load_cage(file)
     print(f"{file}: valid, cage {cage.name} with {len(cage.mark)} marks, sha256 {cage.sha256[:16]}")
+
+
+@segments_app.command("propose")
+def segments_propose(
+    results: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of results with several examinations of a subject.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="segments.csv to write.")] = None,
+) -> None:
+    """Suggest rigid groups of markers, with how sure each is; look at them before you use them."""
+    from rsa_vision import api
+
+    for p in api.propose_segments(results, out):
+        figures = f"probability {p.probability:.4f}, distances change by {p.change_um:.0f} um (rms) in {p.n_exams} examinations"
+        print(f"{p.subject} {p.segment.name}: {', '.join(p.segment.markers)}; {figures}")
+    print(f"segments -> {out}" if out is not None else "to write them: add -o segments.csv")
 
 
 def _describe_cage(cage: Any) -> None:

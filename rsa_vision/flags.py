@@ -25,6 +25,7 @@ class MarkerFlag(IntFlag):
     PREDICTED = 512  # coordinates come from the known segment, not from rays
     NO_COVARIANCE = 1024  # the input gave no covariance
     FOREIGN_MARK = 2048  # a cage mark that this focus is not meant to see; explained, not used
+    LOOSE = 4096  # not where the other markers of its rigid body say
 
 
 def flag_names(value: int) -> str:
@@ -41,6 +42,12 @@ def flag_names(value: int) -> str:
         For example ``"overlap;edge"``.
     """
     return ";".join(flag.name.lower().replace("_", "-") for flag in MarkerFlag if flag & value and flag.name)
+
+
+def flag_value(names: str) -> int:
+    """Return the flags with these names, the inverse of :func:`flag_names`; words that are no flags count for nothing."""
+    wanted = {name.strip() for name in names.split(";")}
+    return sum(int(flag) for flag in MarkerFlag if flag_names(flag) and flag_names(flag) in wanted)
 
 
 REASONS: Final[dict[str, str]] = {
@@ -64,8 +71,9 @@ REASONS: Final[dict[str, str]] = {
     "pair-ambiguous": "another pairing of the object markers explains the rays nearly as well",
     "crossing-large": "rays of a marker miss each other by more than their statistics allow",
     "marker-one-view": "markers were seen from one focus only and have no coordinates",
-    "marker-mismatch": "the markers found are not those of segments.csv",
-    "constellation-ambiguous": "the markers fit segments.csv in more than one way",
+    "marker-mismatch": "the markers found are not those of segments.csv, or of the earlier examinations",
+    "marker-loose": "a marker is not where the other markers of its segment say; leave it out, or look for a wrong pair",
+    "constellation-ambiguous": "the markers fit segments.csv, or the earlier examinations, in more than one way or in none that is sure",
     "no-object-markers": "the cage was found but no object marker",
     "response-unsure": "the film response could not be told from the film; set response in study.toml",
     "geometry": "the points do not determine the focus or the plane",

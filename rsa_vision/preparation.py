@@ -47,14 +47,12 @@ def settle(study_file: Path | None, options: Mapping[str, Any]) -> Study:
         raise SettingsError(f"wrong options\n{describe_validation(error)}") from error
 
 
-def refuse_unbuilt(method: str, segments: object, dask: object, jobs: int, timeout_s: float | None) -> None:
+def refuse_unbuilt(method: str, dask: object, jobs: int, timeout_s: float | None) -> None:
     """Raise :class:`UsageError` for options that cannot be used."""
     if method == "bundle":
         raise UsageError('method "bundle" is not built yet; use --method selvik')
     if method not in METHODS:
         raise UsageError(f"method {method!r} is not known; use selvik")
-    if segments is not None:
-        raise UsageError("markers are not matched with known segments yet; leave --segments out: they are named P01, P02, ...")
     if dask is not None:
         raise UsageError("runs on many machines are not built yet; leave --dask out and use --jobs")
     if jobs < 1:

@@ -28,7 +28,9 @@ def exams() -> list[RenderedExamination]:
     """Two examinations with cage 2 (the smallest films), one film for each focus."""
     rng = np.random.default_rng(20260101)
     few: dict[str, Any] = {"n_objects": 6, "pitch_mm": 0.15, "fine": 2}
-    return [render_examination("2", rng=rng, exam=f"20260{month}010900", **few) for month in (1, 2)]
+    first = render_examination("2", rng=rng, exam="202601010900", **few)
+    moved = [marker.moved(np.eye(3), np.array([4.0, -3.0, 2.0]), np.zeros(3)) for marker in first.scene.markers]  # the object, not changed
+    return [first, render_examination("2", rng=rng, exam="202602010900", **few, markers=moved)]
 
 
 @pytest.fixture

@@ -162,7 +162,7 @@ def test_the_cage_exposed_apart(folder: Path, tmp_path: Path, other_film: Callab
     [
         (["--cage", "3C"], "cage list"),
         (["--method", "bundle"], "selvik"),
-        (["--segments", "segments.csv"], "--segments"),
+        (["--segments", "missing.csv"], "missing.csv"),
         (["--dask", "tcp://somewhere"], "--jobs"),
         (["--jobs", "0"], "at least one"),
         (["--timeout-s", "-1"], "positive"),

@@ -1,0 +1,323 @@
+"""Names through the examinations of a subject: tables of each examination in, the same tables with the names that last out.
+
+Every examination is measured alone and numbers its markers by where they lie. Here known segments are found again among them, and what
+belongs to none keeps the name that it got when it was first seen. Nothing is measured again, so that it can be done anew at any time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from rsa_vision.flags import MarkerFlag, flag_names, flag_value
+from rsa_vision.geometry.rays import RayBundle
+from rsa_vision.geometry.rigid import LEAST_POINTS
+from rsa_vision.identify.constellation import LOOSE_SIGMA, Known, match_bodies, match_segments
+from rsa_vision.identify.hidden import Sighting, find_with_rays, hidden_markers
+from rsa_vision.identify.poses import TOLERANCE_MM, Cloud, place, volume_mm3
+from rsa_vision.segments import Segment, Segments, segments_of
+from rsa_vision.settings import Limits
+from rsa_vision.sightlines import free_rays
+from rsa_vision.tables import SCHEMAS, Row, Rows, split_name
+from rsa_vision.types import Float
+from rsa_vision.verdict import Finding, conclude
+
+MOST_EARLIER: Final = 6  # examinations that one is compared with: the first, and the last ones before it
+AXES: Final = ("x_mm", "y_mm", "z_mm")
+
+
+@dataclass(frozen=True, eq=False)
+class _Hidden:
+    """A marker without rays of its own from two foci: its place by its segment, and its images with their focus and ray."""
+
+    name: str
+    place_mm: Float
+    covariance_mm2: Float
+    images: Mapping[int, tuple[int, RayBundle]]
+    flags: int
+
+
+@dataclass(eq=False)
+class _Exam:
+    """One examination while it is being named."""
+
+    rows: Rows
+    located: list[Row]  # markers that have coordinates
+    cloud: Cloud
+    names: list[str] = field(default_factory=list)  # of these, empty where unknown
+    flags: list[int] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    hidden: list[_Hidden] = field(default_factory=list)
+
+
+def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) -> list[Rows]:
+    """Name the markers of examinations by known segments, and the others as in the earlier examinations of their subject.
+
+    Parameters
+    ----------
+    exams : sequence of dict
+        Rows of the tables of each examination (:func:`rsa_vision.tables.examination_rows`), those of a subject in the order of time.
+    segments : mapping, optional
+        As of :func:`rsa_vision.segments.read_segments`.
+    limits : Limits
+        ``posterior`` is used.
+
+    Returns
+    -------
+    list of dict
+        The same rows with other names (``number`` of object images, ``segment`` and ``marker``), flags, and with what speaks against the
+        names in status, reasons and message. Examinations that failed are as they were.
+    """
+    subjects: dict[str, list[int]] = {}
+    for index, rows in enumerate(exams):
+        subjects.setdefault(rows["exams"][0]["subject"], []).append(index)
+    result = list(exams)
+    for subject, indices in subjects.items():
+        known = None if segments is None else segments_of(segments, subject)
+        earlier: list[_Exam] = []
+        used = 0
+        for index in indices:
+            if exams[index]["exams"][0]["status"] == "failed":
+                continue
+            exam = _open(exams[index])
+            if known is not None:
+                _name_by_segments(exam, known, limits)
+            used = _name_by_earlier(exam, earlier, used, limits)
+            earlier.append(exam)
+            result[index] = _renamed(exam)
+    return result
+
+
+def cloud_of(markers: Sequence[Row]) -> Cloud:
+    """Return rows of ``markers.csv`` that have coordinates as points with their covariances (0 where there is none)."""
+    position = np.array([[row[axis] for axis in AXES] for row in markers], dtype=np.float64).reshape(-1, 3)
+    covariance = np.zeros((len(markers), 3, 3))
+    for i, row in enumerate(markers):
+        sd = np.array([row[f"sd_{axis}"] or 0.0 for axis in AXES])
+        xy, xz, yz = (row[f"cov_{pair}_mm2"] or 0.0 for pair in ("xy", "xz", "yz"))
+        covariance[i] = np.diag(sd**2) + np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
+    return Cloud(position, covariance)
+
+
+def _open(rows: Rows) -> _Exam:
+    located = [row for row in rows["markers"] if row["x_mm"] is not None]
+    return _Exam(rows, located, cloud_of(located), [""] * len(located), [0] * len(located))
+
+
+def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) -> None:
+    if not segments:
+        exam.findings.append(("marker-mismatch", f"segments.csv knows no segment of subject {exam.rows['exams'][0]['subject']}"))
+        return
+    bodies = [Cloud.exact(segment.position_mm) for segment in segments]
+    matched = match_segments(bodies, exam.cloud, limits.posterior)
+    sightings = _sightings(exam, bodies, matched, limits)
+    for segment, known, sighting in zip(segments, matched, sightings, strict=True):
+        for i, a in (*known.pairs, *known.loose, *sighting.pairs):
+            exam.names[a] = f"{segment.name}/{segment.markers[i]}"
+        for _, a in known.loose:
+            exam.flags[a] |= MarkerFlag.LOOSE
+        for _, a in known.doubtful:
+            exam.flags[a] |= MarkerFlag.AMBIGUOUS
+        seen = {i for i, _ in (*sighting.pairs, *sighting.sights)}
+        lost = tuple(i for i in known.lost if i not in seen)
+        exam.findings += _segment_findings(segment, replace(known, lost=lost), sighting, limits)
+        if sighting.placement is not None:
+            exam.hidden += _hidden(segment, sighting, exam)
+    if "pair-ambiguous" in exam.rows["exams"][0]["reasons"].split(";"):
+        doubted = [a for a, row in enumerate(exam.located) if flag_value(row["flags"] or "") & MarkerFlag.AMBIGUOUS]
+        agreed = [exam.names[a] for a in doubted if exam.names[a] and not exam.flags[a]]
+        if agreed:
+            exam.findings.append(("pair-ambiguous", f"the doubtful pairs of {', '.join(agreed)} agree with the constellation"))
+    extra = [_name(row) for row, name in zip(exam.located, exam.names, strict=True) if not name]
+    if extra:
+        exam.findings.append(("marker-mismatch", f"{len(extra)} markers belong to no known segment"))
+
+
+def _sightings(exam: _Exam, bodies: Sequence[Cloud], matched: Sequence[Known], limits: Limits) -> list[Sighting]:
+    """Look for the markers that are missing among single images; what two segments claim goes to neither."""
+    rays = free_rays(exam.rows)
+    nothing = Sighting((), (), None, decisive=True)
+    if not len(rays):
+        return [nothing] * len(bodies)
+    volume = max(volume_mm3(cloud) for cloud in (exam.cloud, *bodies))
+    taken = {a for known in matched for _, a in (*known.pairs, *known.loose, *known.doubtful)}
+    free = np.array([a for a in range(len(exam.cloud)) if a not in taken], dtype=np.int64)
+    found = []
+    for body, known in zip(bodies, matched, strict=True):
+        if known.placement is not None:
+            seen = known.pairs if not known.loose else tuple(pair for pair in known.pairs if pair not in known.loose)
+            missing = set(known.lost)
+            sighting = hidden_markers(body, exam.cloud, seen, known.placement, rays, missing, volume, limits.posterior)
+        elif not known.doubtful:
+            sighting = find_with_rays(body, exam.cloud.rows(free), rays, volume, limits.posterior)
+            sighting = replace(sighting, pairs=tuple((i, int(free[a])) for i, a in sighting.pairs))
+        else:
+            sighting = nothing
+        found.append(sighting if sighting.decisive else replace(nothing, decisive=False))
+    claims = [claim for one in found for claim in {("image", rays.image[r]) for _, r in one.sights} | {("point", a) for _, a in one.pairs}]
+    return [
+        replace(nothing, decisive=False)
+        if any(
+            claims.count(claim) > 1 for claim in [*(("image", rays.image[r]) for _, r in one.sights), *(("point", a) for _, a in one.pairs)]
+        )
+        else replace(one, sights=tuple((i, int(r)) for i, r in one.sights), rays=rays)
+        for one in found
+    ]
+
+
+def _hidden(segment: Segment, sighting: Sighting, exam: _Exam) -> list[_Hidden]:
+    """Return the markers that single images show, where the pose of their segment puts them."""
+    assert sighting.placement is not None
+    assert sighting.rays is not None
+    markers = sorted({i for i, _ in sighting.sights})
+    place_mm, by_pose = sighting.placement.predict(segment.position_mm[markers].reshape(-1, 3))
+    result = []
+    for k, i in enumerate(markers):
+        views = [r for marker, r in sighting.sights if marker == i]
+        images = {int(sighting.rays.image[r]): (int(sighting.rays.focus[r]), sighting.rays.rows(np.array([r]))) for r in views}
+        flags = int(MarkerFlag.PREDICTED | (MarkerFlag.ONE_VIEW if len(views) == 1 else 0))
+        covariance = by_pose[k] + TOLERANCE_MM**2 * np.eye(3)
+        result.append(_Hidden(f"{segment.name}/{segment.markers[i]}", place_mm[k], covariance, images, flags))
+    return result
+
+
+def _segment_findings(segment: Segment, known: Known, sighting: Sighting, limits: Limits) -> list[Finding]:
+    def told(markers: Iterable[int]) -> str:
+        return ", ".join(segment.markers[i] for i in markers)
+
+    findings: list[Finding] = []
+    if known.doubtful:
+        doubt = f"segment {segment.name}: the names of {told(i for i, _ in known.doubtful)} have a posterior below {limits.posterior:g}"
+        findings.append(("constellation-ambiguous", doubt))
+    if known.loose:
+        findings.append(("marker-loose", f"segment {segment.name}: {told(i for i, _ in known.loose)} not where the others say"))
+    if sighting.sights:
+        seen = told(sorted({i for i, _ in sighting.sights}))
+        findings.append(("marker-one-view", f"segment {segment.name}: {seen} seen from one focus only, predicted by the others"))
+    elif not sighting.decisive:
+        findings.append(("constellation-ambiguous", f"segment {segment.name}: single images fit its missing markers in more than one way"))
+    if known.placement is None and sighting.placement is None and not known.doubtful:
+        findings.append(("marker-mismatch", f"segment {segment.name} was not found among the markers"))
+    elif known.lost:
+        findings.append(("marker-mismatch", f"segment {segment.name}: {told(known.lost)} not found"))
+    return findings
+
+
+def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: Limits) -> int:
+    """Give markers without a name that of an earlier examination, or the next free number; return the last number used."""
+    left = [a for a, name in enumerate(exam.names) if not name]
+    points = exam.cloud.rows(np.array(left, dtype=np.int64))
+    given: dict[int, set[str]] = {}
+    doubtful = np.zeros(len(left), bool)
+    for other in (*earlier[:1], *earlier[:0:-1][: MOST_EARLIER - 1]):
+        if len(given) == len(left):
+            break
+        before = [i for i, name in enumerate(other.names) if not split_name(name)[0]]
+        old = other.cloud.rows(np.array(before, dtype=np.int64))
+        bodies, doubts = match_bodies(old, points, limits.posterior)
+        doubtful |= doubts
+        for body in bodies:
+            placement = place(old, points, body) if len(body) >= LEAST_POINTS else None
+            for k, (i, a) in enumerate(body):
+                given.setdefault(a, set()).add(other.names[before[i]])
+                if placement is not None and placement.sigmas[k] > LOOSE_SIGMA:
+                    exam.flags[left[a]] |= MarkerFlag.LOOSE
+    once = [name for names in given.values() for name in names]
+    agreed = {a: next(iter(names)) for a, names in given.items() if len(names) == 1 and once.count(next(iter(names))) == 1}
+    for a, name in agreed.items():
+        exam.names[left[a]] = name
+    new = [a for a in range(len(left)) if a not in agreed]
+    for a in new:
+        used += 1
+        exam.names[left[a]] = f"P{used:02d}"
+    if earlier:
+        known = {name for other in earlier for name in other.names if not split_name(name)[0]}
+        exam.findings += _earlier_findings(exam, [left[a] for a in new], [left[a] for a in new if doubtful[a]], known)
+    return used
+
+
+def _earlier_findings(exam: _Exam, new: Sequence[int], doubtful: Sequence[int], known: set[str]) -> list[Finding]:
+    missing = sorted(known - set(exam.names))
+    told = ", ".join(exam.names[a] for a in new)
+    loose = [exam.names[a] for a, flags in enumerate(exam.flags) if flags & MarkerFlag.LOOSE and not split_name(exam.names[a])[0]]
+    findings: list[Finding] = []
+    if loose:
+        findings.append(("marker-loose", f"{', '.join(loose)} not where the others of the same rigid group say"))
+    if new and missing:
+        for a in doubtful:
+            exam.flags[a] |= MarkerFlag.AMBIGUOUS
+        why = f"{told} may be {', '.join(missing)} of earlier examinations: too few markers keep their distances to tell"
+        findings.append(("constellation-ambiguous", why))
+    elif new:
+        findings.append(("marker-mismatch", f"{told} were not seen in earlier examinations"))
+    return findings
+
+
+def _renamed(exam: _Exam) -> Rows:
+    """Return the rows with the names that were found; markers without coordinates keep theirs unless it is given away."""
+    names = {_name(row): name for row, name in zip(exam.located, exam.names, strict=True)}
+    taken = set(exam.names)
+    for row in exam.rows["markers"]:
+        if row["x_mm"] is None:
+            names[_name(row)] = _free(_name(row), taken)
+            taken.add(names[_name(row)])
+    flags = dict(zip(map(_name, exam.located), exam.flags, strict=True))
+    markers = []
+    for row in exam.rows["markers"]:
+        segment, marker = split_name(names[_name(row)])
+        markers.append({**row, "segment": segment, "marker": marker, "flags": _with_flags(row, flags.get(_name(row), 0))})
+    images = [
+        {**row, "number": names.get(row["number"], row["number"]), "flags": _with_flags(row, flags.get(row["number"], 0))}
+        if row["role"] == "object"
+        else row
+        for row in exam.rows["images"]
+    ]
+    for hidden in exam.hidden:
+        markers.append(_predicted(exam.rows["exams"][0], hidden))
+        for index, (focus, ray) in hidden.images.items():
+            images[index] = _seen(images[index], hidden, focus, ray)
+    return {**exam.rows, "exams": [_judged(exam.rows["exams"][0], exam.findings)], "images": images, "markers": markers}
+
+
+def _predicted(exam: Row, hidden: _Hidden) -> Row:
+    segment, marker = split_name(hidden.name)
+    row: Row = dict.fromkeys(SCHEMAS["markers"]) | {"subject": exam["subject"], "exam": exam["exam"], "segment": segment, "marker": marker}
+    cov = hidden.covariance_mm2
+    row |= dict(zip(AXES, hidden.place_mm.tolist(), strict=True))
+    row |= dict(zip((f"sd_{axis}" for axis in AXES), np.sqrt(np.diagonal(cov)).tolist(), strict=True))
+    row |= {"cov_xy_mm2": float(cov[0, 1]), "cov_xz_mm2": float(cov[0, 2]), "cov_yz_mm2": float(cov[1, 2])}
+    return row | {"n_views": len(hidden.images), "flags": flag_names(hidden.flags)}
+
+
+def _seen(row: Row, hidden: _Hidden, focus: int, ray: RayBundle) -> Row:
+    through = ray.through_mm[0]
+    away = float(np.linalg.norm(np.cross(hidden.place_mm - through, ray.direction[0])))
+    named = {"focus": focus, "role": "object", "number": hidden.name, "residual_um": 1000 * away, "used": True}
+    return {**row, **named, **dict(zip(AXES, through.tolist(), strict=True)), "flags": _with_flags(row, int(MarkerFlag.ONE_VIEW))}
+
+
+def _free(name: str, taken: set[str]) -> str:
+    number = 0
+    free = name
+    while free in taken:
+        number += 1
+        free = f"{name}-{number}"
+    return free
+
+
+def _with_flags(row: Mapping[str, str], flags: int) -> str:
+    return flag_names(flag_value(row["flags"] or "") | flags)
+
+
+def _judged(row: Row, findings: Sequence[Finding]) -> Row:
+    """Return a row of ``exams.csv`` with findings added."""
+    verdict = conclude([*((code, row["message"]) for code in filter(None, row["reasons"].split(";"))), *findings])
+    messages = [*filter(None, [row["message"]]), *(message for _, message in findings if message not in (row["message"] or ""))]
+    return {**row, "status": verdict.status, "reasons": ";".join(verdict.reasons), "message": " | ".join(dict.fromkeys(messages))}
+
+
+def _name(row: Row) -> str:
+    return f"{row['segment']}/{row['marker']}" if row["segment"] else str(row["marker"])

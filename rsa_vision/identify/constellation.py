@@ -1,0 +1,236 @@
+"""Markers known again: constellations of known segments, or rigid groups of an earlier examination, among the points found.
+
+Assignments (:mod:`poses`) compete for the points: all ways of explaining the points are summed (:mod:`packing`), and a name carries the sum
+of the probabilities of all that give it. Below the limit there is no name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.special import gammaln
+
+from rsa_vision.geometry.rigid import LEAST_POINTS
+from rsa_vision.identify.packing import pack
+from rsa_vision.identify.poses import GATE, Cloud, Pairs, Placement, candidate_poses, disjoint, nearness, place, volume_mm3
+from rsa_vision.types import Bool, Float, Int
+
+FOUND: Final = 0.9  # probability that a marker of a known segment is among the points
+STRAY: Final = 3.0  # expected points that belong to nothing known, at least
+LOOSE_MM: Final = 3.0  # how far a marker may have moved in its bone and still be known by its place
+LOOSE_SIGMA: Final = 4.0  # residual of a marker that has moved
+NEGLIGIBLE: Final = -7.0  # log odds below which an assignment is not counted
+MOST_RIVALS: Final = 60  # assignments of one body that compete
+MOST_PARTS: Final = 8  # overlapping bodies that are taken apart
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """What became of one segment.
+
+    Attributes
+    ----------
+    pairs : tuple of (marker, point)
+        Decisive names.
+    doubtful : tuple of (marker, point)
+        Names that are the best, but not decisive.
+    loose : tuple of (marker, point)
+        Markers that do not fit the rigid body: of `pairs`, and points that lie alone near the place of a marker that is missing.
+    lost : tuple of int
+        Markers without a point.
+    placement : Placement or None
+        By `pairs`; None with fewer than three.
+    """
+
+    pairs: Pairs
+    doubtful: Pairs
+    loose: Pairs
+    lost: tuple[int, ...]
+    placement: Placement | None
+
+
+def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -> list[Known]:
+    """Find the markers of known segments among points; each segment has a pose of its own.
+
+    Parameters
+    ----------
+    segments : sequence of Cloud
+        Three markers or more each, in any frame.
+    points : Cloud
+    posterior : float
+        Least probability of a name.
+
+    Returns
+    -------
+    list of Known
+        One of each segment.
+    """
+    volume = volume_mm3(points)
+    stray = STRAY + max(0, len(points) - sum(map(len, segments)))
+    owner: list[int] = []
+    groups: list[Pairs] = []
+    gain: list[float] = []
+    for index, segment in enumerate(segments):
+        n = len(segment)
+        rivals = [
+            (_odds(placement, len(pairs), volume, stray) + len(pairs) * np.log(FOUND) + (n - len(pairs)) * np.log(1 - FOUND), pairs)
+            for pairs, placement in candidate_poses(segment, points, float(np.log(volume / stray)))
+        ]
+        for odds, pairs in _likeliest(rivals):
+            owner.append(index)
+            groups.append(pairs)
+            gain.append(odds)
+    claims = [(*(a for _, a in pairs), len(points) + index) for pairs, index in zip(groups, owner, strict=True)]
+    packing = pack(claims, np.array(gain))
+    chances = np.nan_to_num(packing.posterior)
+    known = []
+    for index, segment in enumerate(segments):
+        mine = [g for g in range(len(groups)) if owner[g] == index]
+        best = next((groups[g] for g in mine if packing.chosen[g]), ())
+        known.append(_known(segment, points, best, _names([groups[g] for g in mine], chances[mine]), posterior))
+    return _with_loose(segments, points, known)
+
+
+def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[Pairs], Bool]:
+    """Find again the points of an earlier examination where the rigid groups are not known.
+
+    Parameters
+    ----------
+    before, points : Cloud
+    posterior : float
+        Least probability of a name.
+
+    Returns
+    -------
+    bodies : list of tuple of (earlier point, point)
+        Decisive names by the rigid group that shows them.
+    doubtful : ndarray of bool, shape (m,)
+        Points that fit an earlier one, but not decisively.
+
+    Notes
+    -----
+    What is decisive is fixed, and the rest looked at again: three points left over on both sides show what three of many cannot, and a
+    group that shares three names or more with what is fixed is judged by what it adds.
+    """
+    volume = volume_mm3(points)
+    listed = candidate_poses(before, points, float(np.log(volume / max(len(points), 1))))
+    listed += _parts(before, points, listed)
+    named: dict[int, int] = {}
+    bodies: list[Pairs] = []
+    chosen: list[Pairs] = []
+    while True:
+        mine, theirs = _others(len(before), named.keys()), _others(len(points), named.values())
+        left = candidate_poses(before.rows(mine), points.rows(theirs), float(np.log(volume / max(len(theirs), 1)))) if named else []
+        again = [(tuple((int(mine[i]), int(theirs[a])) for i, a in pairs), placement) for pairs, placement in left]
+        rivals = _additions(before, points, {**dict(listed), **dict(again)}, named, volume)
+        chances, chosen = _summed(rivals, len(points))
+        found = [kept for body in chosen if (kept := tuple(pair for pair in body if chances[pair] >= posterior))]
+        if not found:
+            break
+        bodies += found
+        named |= {i: a for body in found for i, a in body}
+    doubtful = np.zeros(len(points), bool)
+    doubtful[[a for body in chosen for _, a in body]] = True
+    return bodies, doubtful
+
+
+def _others(n: int, taken: Iterable[int]) -> Int:
+    return np.setdiff1d(np.arange(n), list(taken)).astype(np.int64)
+
+
+def _parts(before: Cloud, points: Cloud, listed: Sequence[tuple[Pairs, Placement]]) -> list[tuple[Pairs, Placement]]:
+    """Take overlapping bodies apart: bodies that have moved little against each other fit one pose in parts."""
+    largest: list[Pairs] = []
+    for pairs, _ in sorted(listed, key=lambda one: (-len(one[0]), -one[1].log_likelihood, one[0])):
+        if len(largest) < MOST_PARTS and not any(set(pairs) <= set(other) for other in largest):
+            largest.append(pairs)
+    known = dict(listed)
+    parts = [part for part in disjoint(largest) if part not in known]
+    return [(part, placement) for part in parts if (placement := place(before, points, part))]
+
+
+def _additions(
+    before: Cloud, points: Cloud, listed: Mapping[Pairs, Placement], named: Mapping[int, int], volume: float
+) -> list[tuple[float, Pairs]]:
+    """Return the log odds of what each group adds to the names, that contradict none."""
+    n, m = len(before) - len(named), len(points) - len(named)
+    owner = {a: i for i, a in named.items()}
+    base: dict[Pairs, float] = {}
+    rivals: dict[Pairs, float] = {}
+    for pairs, placement in listed.items():
+        if any(named.get(i, a) != a or owner.get(a, i) != i for i, a in pairs):
+            continue
+        old, new = tuple(pair for pair in pairs if pair[0] in named), tuple(pair for pair in pairs if pair[0] not in named)
+        k = len(new)
+        if not new or 0 < len(old) < LEAST_POINTS:
+            continue
+        odds = k * float(np.log(FOUND)) - _log_ways(n, k)  # any k may be the body
+        if not old:
+            odds += _odds(placement, k, volume, m)
+        else:
+            if old not in base:
+                base[old] = fixed.log_likelihood if (fixed := place(before, points, old)) else np.inf
+            odds += placement.log_likelihood - base[old] - k * float(np.log(m / volume)) - _log_ways(len(named), len(old))
+        rivals[new] = max(rivals.get(new, -np.inf), odds)
+    return _likeliest([(odds, pairs) for pairs, odds in rivals.items()])
+
+
+def _log_ways(n: int, k: int) -> float:
+    return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+
+
+def _summed(rivals: Sequence[tuple[float, Pairs]], m: int) -> tuple[dict[tuple[int, int], float], list[Pairs]]:
+    groups = [pairs for _, pairs in rivals]
+    packing = pack([(*(a for _, a in pairs), *(m + i for i, _ in pairs)) for pairs in groups], np.array([odds for odds, _ in rivals]))
+    return _names(groups, np.nan_to_num(packing.posterior)), [groups[g] for g in np.flatnonzero(packing.chosen)]
+
+
+def _odds(placement: Placement, k: int, volume: float, stray: float) -> float:
+    """Return the log odds of a body at an unknown pose against `stray` points that lie anywhere in the volume."""
+    return placement.log_likelihood - float(np.log(8 * np.pi**2 * volume)) - k * float(np.log(stray / volume))
+
+
+def _likeliest(rivals: list[tuple[float, Pairs]]) -> list[tuple[float, Pairs]]:
+    return sorted((rival for rival in rivals if rival[0] > NEGLIGIBLE), key=lambda rival: (-rival[0], rival[1]))[:MOST_RIVALS]
+
+
+def _names(groups: Sequence[Pairs], chances: Float) -> dict[tuple[int, int], float]:
+    names: dict[tuple[int, int], float] = {}
+    for pairs, chance in zip(groups, chances.tolist(), strict=True):
+        for pair in pairs:
+            names[pair] = names.get(pair, 0.0) + chance
+    return names
+
+
+def _known(segment: Cloud, points: Cloud, best: Pairs, names: dict[tuple[int, int], float], posterior: float) -> Known:
+    pairs = tuple(pair for pair in best if names[pair] >= posterior)
+    doubtful = tuple(pair for pair in best if names[pair] < posterior)
+    placement = place(segment, points, pairs) if len(pairs) >= LEAST_POINTS else None
+    if placement is None:
+        pairs, doubtful = (), best
+    moved = () if placement is None else tuple(p for p, sigma in zip(pairs, placement.sigmas, strict=True) if sigma > LOOSE_SIGMA)
+    named = {i for i, _ in best}
+    return Known(pairs, doubtful, moved, tuple(i for i in range(len(segment)) if i not in named), placement)
+
+
+def _with_loose(segments: Sequence[Cloud], points: Cloud, known: list[Known]) -> list[Known]:
+    """Add markers that have moved in their bone: a point that nothing else explains, alone near the place of one missing marker alone."""
+    taken = {a for one in known for _, a in (*one.pairs, *one.doubtful)}
+    free = np.array([a for a in range(len(points)) if a not in taken], dtype=np.int64)
+    near: list[tuple[int, int, int]] = []
+    for index, (segment, one) in enumerate(zip(segments, known, strict=True)):
+        if one.placement is not None and one.lost and len(free):
+            missing = segment.rows(np.array(one.lost))
+            away = np.linalg.norm(points.position_mm[free] - one.placement.predict(missing.position_mm)[0][:, None], axis=-1)
+            close = (away < LOOSE_MM) | (nearness(missing, points.rows(free), one.placement) < GATE)
+            near += [(index, one.lost[i], int(free[a])) for i, a in zip(*np.nonzero(close), strict=True)]
+    alone = [x for x in near if sum(x[:2] == y[:2] for y in near) == 1 and sum(x[2] == y[2] for y in near) == 1]
+    result = []
+    for index, one in enumerate(known):
+        mine = tuple((i, a) for s, i, a in alone if s == index)
+        lost = tuple(i for i in one.lost if i not in {i for i, _ in mine})
+        result.append(Known(one.pairs, one.doubtful, tuple(sorted({*one.loose, *mine})), lost, one.placement))
+    return result

@@ -1,0 +1,283 @@
+"""Markers that one focus alone shows: the pose of a known segment from all rays that see it.
+
+The marker-configuration model (Kaptein, Valstar, Stoel, Rozing, Reiber 2005): the pose that minimises the squared distances of the markers
+from their rays, in units of their sd; a marker seen from several foci counts as the point that its rays gave. Which ray belongs to which
+marker competes as the names do (:mod:`constellation`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Final
+
+import numpy as np
+from scipy.special import logsumexp
+
+from rsa_vision.geometry.rays import RayBundle
+from rsa_vision.identify.constellation import FOUND, NEGLIGIBLE, STRAY
+from rsa_vision.identify.packing import pack
+from rsa_vision.identify.poses import (
+    GATE,
+    GATE_SCALE,
+    SCALES,
+    TOLERANCE_MM,
+    Cloud,
+    Pairs,
+    Placement,
+    distances,
+    nearness,
+    rotation_by,
+)
+from rsa_vision.identify.ray_poses import off_rays, place_with_rays
+from rsa_vision.types import Bool, Float
+
+TURNS: Final = 90  # poses tried around the line through two known places
+COARSE_MM: Final = 3.0  # how near a ray must come to be tried then
+GRAZING_MM: Final = 0.5  # by which a ray may miss the sphere on which its marker lies
+MOST_TRIED: Final = 150
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """A segment with markers that one focus alone shows.
+
+    Attributes
+    ----------
+    pairs : tuple of (marker, point)
+    sights : tuple of (marker, ray)
+    placement : Placement or None
+        By both; None if no pose is found.
+    decisive : bool
+        No other assignment or pose is nearly as likely.
+    rays : RayBundle or None
+        Those that `sights` count.
+    """
+
+    pairs: Pairs
+    sights: Pairs
+    placement: Placement | None
+    decisive: bool
+    rays: RayBundle | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    body: Cloud
+    points: Cloud
+    rays: RayBundle
+    volume: float
+    stray: float
+
+    @property
+    def worth(self) -> tuple[float, float]:
+        """Log worth of a point (3-D) and of a ray (2-D) that need not be explained otherwise."""
+        area = self.volume ** (2 / 3)
+        return float(np.log(self.volume / self.stray)), float(np.log(area / (STRAY + len(self.rays))))
+
+
+def hidden_markers(
+    body: Cloud,
+    points: Cloud,
+    pairs: Pairs,
+    placement: Placement,
+    rays: RayBundle,
+    missing: Collection[int],
+    volume: float,
+    posterior: float,
+) -> Sighting:
+    """Find the missing markers of a segment whose pose is known among rays that belong to nothing.
+
+    Parameters
+    ----------
+    body, points : Cloud
+    pairs : tuple of (marker, point)
+    placement : Placement
+        By `pairs`.
+    rays : RayBundle
+    missing : collection of int
+        Markers without a point.
+    volume : float
+        In which markers may be, mm³.
+    posterior : float
+        Least probability that a ray belongs to a marker.
+
+    Returns
+    -------
+    Sighting
+        ``decisive`` is False where a ray may be of a missing marker, but not decisively.
+    """
+    scene = _Scene(body, points, rays, volume, STRAY)
+    away, log_density = off_rays(body, rays, placement)
+    marker, ray = np.nonzero(away < GATE)
+    tried = [(int(i), int(r)) for i, r in zip(marker, ray, strict=True) if i in missing]
+    if not tried:
+        return Sighting(pairs, (), placement, True)
+    focus = {value: index for index, value in enumerate(sorted(set(rays.focus.tolist())))}
+    claims = [(len(rays) + i * len(focus) + focus[int(rays.focus[r])], r) for i, r in tried]
+    gain = np.array([log_density[i, r] + scene.worth[1] for i, r in tried])
+    packing = pack(claims, gain)
+    sure = np.nan_to_num(packing.posterior) >= posterior
+    sights = tuple(sorted(pair for pair, chosen, is_sure in zip(tried, packing.chosen, sure, strict=True) if chosen and is_sure))
+    together = place_with_rays(body, points, pairs, rays, sights, placement.rotation, placement.translation) if sights else placement
+    return Sighting(pairs, sights, together or placement, bool(together) and not (packing.chosen & ~sure).any())
+
+
+def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, posterior: float) -> Sighting:
+    """Find a segment with fewer than three markers seen from several foci: by these and by rays that belong to nothing.
+
+    Parameters
+    ----------
+    body, points : Cloud
+        `points` that belong to no other segment.
+    rays : RayBundle
+    volume : float
+    posterior : float
+
+    Returns
+    -------
+    Sighting
+        The best assignment and pose; ``decisive`` only if all others together, and chance, leave it the probability `posterior`.
+
+    Notes
+    -----
+    Two places begin a hypothesis: points of two markers with their distance, or a point and where a ray pierces the sphere about it on
+    which another marker must lie. The body is turned about the line through both, and where a third marker meets a ray its pose is fitted
+    and grown.
+    """
+    scene = _Scene(body, points, rays, volume, STRAY + len(points))
+    starts = sorted(_starts(scene), key=lambda start: -start.met)
+    found: dict[tuple[Pairs, Pairs], list[Placement]] = {}
+    for start in starts[:MOST_TRIED]:
+        if (grown := _grown(scene, start)) is not None:
+            kept, seen, placement = grown
+            same = found.setdefault((kept, seen), [])
+            if all(
+                np.linalg.norm(placement.predict(body.position_mm)[0] - p.predict(body.position_mm)[0], axis=1).max() > 1.0 for p in same
+            ):
+                same.append(placement)
+    every = [(_log_odds(scene, *key, placement), key, placement) for key, placements in found.items() for placement in placements]
+    every = sorted((one for one in every if one[0] > NEGLIGIBLE), key=lambda one: (-one[0], one[1]))
+    if not every:
+        return Sighting((), (), None, False)
+    odds, (pairs, sights), placement = every[0]
+    total = float(logsumexp([0.0, *(one[0] for one in every)]))
+    untried = starts[MOST_TRIED].met if len(starts) > MOST_TRIED else 0  # as many markers might be met there
+    decisive = np.exp(odds - total) >= posterior and untried < len({i for i, _ in (*pairs, *sights)})
+    return Sighting(pairs, sights, placement, bool(decisive))
+
+
+def _log_odds(scene: _Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> float:
+    n, found = len(scene.body), len({i for i, _ in (*pairs, *sights)})
+    worth = len(pairs) * scene.worth[0] + len(sights) * scene.worth[1] - float(np.log(8 * np.pi**2 * scene.volume))
+    return placement.log_likelihood + worth + found * float(np.log(FOUND)) + (n - found) * float(np.log(1 - FOUND))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """A first pose, what it rests on, and how many markers it brings near a point or a ray."""
+
+    rotation: Float
+    translation: Float
+    pairs: Pairs
+    sights: Pairs
+    met: int
+
+
+def _starts(scene: _Scene) -> Iterator[_Start]:
+    body, places = scene.body, scene.points.position_mm
+    length = distances(body)[0]
+    for i, j in permutations(range(len(body)), 2):
+        for a, base in enumerate(places):
+            ends: list[tuple[Float, Pairs, Pairs]] = []
+            for b, end in enumerate(places if i < j else ()):
+                spread = scene.points.covariance_mm2[a] + scene.points.covariance_mm2[b]
+                sd = np.sqrt(GATE_SCALE**2 * np.linalg.eigvalsh(spread)[-1] + 2 * TOLERANCE_MM**2)
+                if a != b and abs(float(np.linalg.norm(end - base)) - length[i, j]) < GATE * sd:
+                    ends.append((end, ((i, a), (j, b)), ()))
+            for r in range(len(scene.rays)):
+                ends += [(end, ((i, a),), ((j, r),)) for end in _pierced(scene, base, float(length[i, j]), r)]
+            for end, pairs, sights in ends:
+                yield from _turned(scene, (i, j), (base, end), pairs, sights)
+
+
+def _pierced(scene: _Scene, base: Float, radius: float, r: int) -> list[Float]:
+    """Return where a ray meets a sphere, or comes next to it if it just misses."""
+    through, direction = scene.rays.through_mm[r], scene.rays.direction[r]
+    along = float((base - through) @ direction)
+    foot = through + along * direction
+    square = radius**2 - float(((foot - base) ** 2).sum())
+    if square < -2 * radius * GRAZING_MM:
+        return []
+    half = float(np.sqrt(max(square, 0.0)))
+    return [foot + half * direction, foot - half * direction] if half > 0 else [foot]
+
+
+def _turned(scene: _Scene, ends: tuple[int, int], places: tuple[Float, Float], pairs: Pairs, sights: Pairs) -> Iterator[_Start]:
+    """Turn the body about the line through two places; yield the poses at which another marker passes a ray."""
+    (i, j), (base, end), body = ends, places, scene.body.position_mm
+    line = end - base
+    first, axis = _aligning(body[j] - body[i], line), line / np.linalg.norm(line)
+    turns = np.stack([rotation_by(axis * angle) @ first for angle in np.arange(TURNS) * 2 * np.pi / TURNS])
+    moved = np.einsum("tij,nj->tni", turns, body - body[i]) + base  # (t, n, 3)
+    off = np.linalg.norm(np.cross(moved[:, :, None] - scene.rays.through_mm, scene.rays.direction), axis=-1)  # (t, n, r)
+    away = np.linalg.norm(moved[:, :, None] - scene.points.position_mm, axis=-1)
+    met = ((off < COARSE_MM).any(axis=2) | (away < COARSE_MM).any(axis=2)).sum(axis=1)
+    least = (off < COARSE_MM) & (off <= np.roll(off, 1, axis=0)) & (off < np.roll(off, -1, axis=0))
+    for t, marker, ray in np.argwhere(least).tolist():
+        if marker not in ends and ray not in {r for _, r in sights}:
+            seen = tuple(sorted([*sights, (marker, ray)]))
+            yield _Start(turns[t], base - turns[t] @ body[i], pairs, seen, int(met[t]))
+
+
+def _aligning(source: Float, target: Float) -> Float:
+    """Return a rotation that turns one direction into another."""
+    a, b = source / np.linalg.norm(source), target / np.linalg.norm(target)
+    axis = np.cross(a, b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        other = np.cross(a, [1.0, 0, 0] if abs(a[0]) < 0.9 else [0, 1.0, 0])
+        return np.eye(3) if a @ b > 0 else rotation_by(np.pi * other / np.linalg.norm(other))
+    return rotation_by(axis / sine * np.arctan2(sine, a @ b))
+
+
+def _grown(scene: _Scene, start: _Start) -> tuple[Pairs, Pairs, Placement] | None:
+    """Fit a first pose, and take in what it meets until nothing changes."""
+    body, points, rays = scene.body, scene.points, scene.rays
+    pairs, sights, rotation, translation = start.pairs, start.sights, start.rotation, start.translation
+    placement: Placement | None = None
+    for _ in range(6):
+        placement = place_with_rays(body, points, pairs, rays, sights, rotation, translation)
+        if placement is None or not (placement.sigmas < GATE * max(SCALES)).all():
+            return None
+        rotation, translation = placement.rotation, placement.translation
+        again = _met(scene, placement)
+        if again == (pairs, sights):
+            return pairs, sights, placement
+        pairs, sights = again
+        if 3 * len(pairs) + 2 * len(sights) < 7 or len({i for i, _ in (*pairs, *sights)}) < 3:
+            return None
+    return (pairs, sights, placement) if placement is not None and (pairs, sights) == _met(scene, placement) else None
+
+
+def _met(scene: _Scene, placement: Placement) -> tuple[Pairs, Pairs]:
+    """Return the points and rays that markers meet at a pose: the nearest in units of sd first, points before rays."""
+    pairs: dict[int, int] = {}
+    sights: dict[tuple[int, int], int] = {}
+    away = nearness(scene.body, scene.points, placement) if len(scene.points) else np.zeros((len(scene.body), 0))
+    for i, a in _ranked(away, away < GATE):
+        if i not in pairs and a not in pairs.values():
+            pairs[i] = a
+    off, _ = off_rays(scene.body, scene.rays, placement)
+    for i, r in _ranked(off, off < GATE):
+        seen = (i, int(scene.rays.focus[r]))
+        if i not in pairs and seen not in sights and scene.rays.image[r] not in {scene.rays.image[x] for x in sights.values()}:
+            sights[seen] = r
+    return tuple(sorted(pairs.items())), tuple(sorted((i, r) for (i, _), r in sights.items()))
+
+
+def _ranked(cost: Float, possible: Bool) -> list[tuple[int, int]]:
+    first, second = np.nonzero(possible)
+    order = np.argsort(cost[first, second], kind="stable")
+    return [(int(first[o]), int(second[o])) for o in order]

@@ -1,0 +1,141 @@
+"""Known segments: the constellation of markers in each bone or implant (``segments.csv``)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from rsa_vision.errors import SettingsError
+from rsa_vision.types import Float
+
+COLUMNS: Final = ("subject", "segment", "marker", "x_mm", "y_mm", "z_mm")
+LEAST_MARKERS: Final = 3
+LEAST_HEIGHT_MM: Final = 1.0  # of the markers from the line that fits them best
+LEAST_DISTANCE_MM: Final = 0.2  # less is the same marker twice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segment:
+    """Markers that move as one rigid body.
+
+    Attributes
+    ----------
+    name : str
+    markers : tuple of str
+    position_mm : ndarray of shape (n, 3)
+        In any rigid frame.
+    """
+
+    name: str
+    markers: tuple[str, ...]
+    position_mm: Float
+
+
+Segments = Mapping[str, Sequence[Segment]]
+"""Segments by subject; those of the empty subject belong to everybody."""
+
+
+def segments_of(segments: Segments, subject: str) -> list[Segment]:
+    """Return the segments of a subject: its own, and those of everybody that it has not."""
+    own = list(segments.get(subject, ()))
+    names = {segment.name for segment in own}
+    return own + ([segment for segment in segments.get("", ()) if segment.name not in names] if subject else [])
+
+
+def read_segments(path: Path) -> dict[str, list[Segment]]:
+    """Read the segments of all subjects.
+
+    Parameters
+    ----------
+    path : Path
+        CSV file with the columns subject (may be empty: of everybody), segment, marker, x_mm, y_mm, z_mm; others are ignored.
+
+    Returns
+    -------
+    dict of str to list of Segment
+        By subject, in the order of the file.
+
+    Raises
+    ------
+    SettingsError
+        If it cannot be read, lacks columns, names a marker twice or not at all, has values that are no numbers, or a segment whose markers
+        do not determine its pose; every error is listed with its line.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, strict=True)
+            header = [name.strip() for name in next(reader, [])]
+            lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(cell.strip() for cell in cells)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SettingsError(f"{path}: not a readable CSV file ({error}); give a table with the columns {', '.join(COLUMNS)}") from error
+    problems = [f"column {name} is missing" for name in COLUMNS if name not in header]
+    problems += [f"column {name} stands twice" for name in COLUMNS if header.count(name) > 1]
+    if not (lines or problems):
+        problems.append("there is no marker in it")
+    found: dict[tuple[str, str], dict[str, tuple[float, ...]]] = {}
+    if not problems:
+        for line, cells in lines:
+            problems += [f"line {line}: {problem}" for problem in _read_line(header, cells, found)]
+    if not problems:
+        problems = [text for (subject, name), markers in found.items() for text in _doubts(subject, name, markers)]
+    if problems:
+        raise SettingsError(f"{path}: wrong segments\n" + "\n".join(f"  {problem}" for problem in problems))
+    result: dict[str, list[Segment]] = {}
+    for (subject, name), markers in found.items():
+        result.setdefault(subject, []).append(Segment(name, tuple(markers), np.array(list(markers.values()))))
+    return result
+
+
+def segments_csv(subjects: Iterable[tuple[str, Sequence[Segment]]]) -> str:
+    """Return segments as the text of a ``segments.csv``; the rest of the digits of a micrometre is left out."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for subject, segments in subjects:
+        for segment in segments:
+            for marker, place in zip(segment.markers, segment.position_mm.tolist(), strict=True):
+                writer.writerow([subject, segment.name, marker, *(f"{value:.4f}" for value in place)])
+    return text.getvalue()
+
+
+def _read_line(header: list[str], cells: list[str], found: dict[tuple[str, str], dict[str, tuple[float, ...]]]) -> list[str]:
+    if len(cells) != len(header):
+        return [f"{len(cells)} values for {len(header)} columns"]
+    row = dict(zip(header, cells, strict=True))
+    problems = [f"{name} is empty" for name in ("segment", "marker") if not row[name]]
+    problems += [f"{name} {row[name]!r} must not hold a slash" for name in ("segment", "marker") if "/" in row[name]]
+    place = []
+    for axis in COLUMNS[3:]:
+        try:
+            place.append(float(row[axis]))
+        except ValueError:
+            place.append(math.nan)
+        if not math.isfinite(place[-1]):
+            problems.append(f"{axis} is {row[axis]!r}, not a finite number")
+    markers = found.setdefault((row["subject"], row["segment"]), {})
+    if row["marker"] in markers:
+        problems.append(f"marker {row['segment']}/{row['marker']} stands there already")
+    markers[row["marker"]] = tuple(place)
+    return problems
+
+
+def _doubts(subject: str, name: str, markers: Mapping[str, tuple[float, ...]]) -> list[str]:
+    whose = f"segment {name}" + (f" of {subject}" if subject else "")
+    if len(markers) < LEAST_MARKERS:
+        return [f"{whose}: {len(markers)} markers, {LEAST_MARKERS} or more are needed to know it again: add markers or leave it out"]
+    places = np.array(list(markers.values()))
+    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(len(places))
+    names = list(markers)
+    same = [(names[i], names[j]) for i, j in np.argwhere(apart < LEAST_DISTANCE_MM).tolist() if i < j]
+    if same:
+        return [f"{whose}: {a} and {b} are the same place: correct one of them" for a, b in same]
+    if np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] < LEAST_HEIGHT_MM:
+        return [f"{whose}: its markers lie in line and determine no pose: add a marker beside the line, or leave it out"]
+    return []

@@ -1,0 +1,238 @@
+"""Names through the examinations of a subject, as a user meets them: segments.csv, P01 ... kept, hidden markers, proposals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+import rsa_vision
+from rsa_vision.cli import run_app
+from rsa_vision.errors import SettingsError
+from rsa_vision.followup import follow_up
+from rsa_vision.segments import Segment, read_segments
+from rsa_vision.settings import Limits
+from rsa_vision.tables import SCHEMAS
+from rsa_vision.types import MarkerImages
+from synthetic.study import make_study
+from tests.cli.conftest import SD_PX, content
+
+TEXT = {"subject": pl.String, "exam": pl.String, "segment": pl.String, "marker": pl.String, "flags": pl.String, "number": pl.String}
+FIRST, SECOND, THIRD = "202601010900", "202601020900", "202601030900"
+
+
+def read(path: Path) -> pl.DataFrame:
+    return pl.read_csv(path, schema_overrides=TEXT)
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three examinations of two bodies that move against each other."""
+    folder = tmp_path_factory.mktemp("study")
+    box = np.array([[-25.0, 40, 60], [45, 130, 140]])
+    make_study(
+        folder,
+        "2",
+        rng=np.random.default_rng(5),
+        n_exams=3,
+        segments={"bone": 6, "implant": 5},
+        box_mm=box,
+        pitch_mm=0.15,
+        fine=1,
+        quanta=None,
+    )
+    return folder
+
+
+@pytest.fixture
+def hide(films: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Let examinations see the true images but those of some markers, named by (exam, focus, marker)."""
+    import cv2
+
+    truth = read(films / "truth" / "images.csv")
+
+    def hiding(*hidden: tuple[str, int, str]) -> None:
+        rng = np.random.default_rng(7)
+        known: dict[str, MarkerImages] = {}
+        for name in truth["file"].unique(maintain_order=True):
+            rows = [r for r in truth.filter(pl.col("file") == name).to_dicts() if (r["exam"], r["focus"], r["number"]) not in hidden]
+            n = len(rows)
+            known[name] = MarkerImages(
+                position_px=np.array([[r["col_px"], r["row_px"]] for r in rows]) + rng.normal(0, SD_PX, (n, 2)),
+                covariance_px2=np.tile(np.eye(2) * SD_PX**2, (n, 1, 1)),
+                shape=np.array([r["shape"] for r in rows]),
+                radius_px=np.full(n, 3.0),
+                angle_deg=np.full(n, np.nan),
+                contrast=np.full(n, 0.5),
+                snr=np.full(n, 50.0),
+                flags=np.zeros(n, np.int64),
+            )
+        by_content = {content(cv2.imread(str(films / name), cv2.IMREAD_UNCHANGED)): images for name, images in known.items()}
+        monkeypatch.setattr(
+            "rsa_vision.examination.detect_markers",
+            lambda values, **_: SimpleNamespace(images=by_content[content(values)]),
+        )
+
+    return hiding
+
+
+def places(table: pl.DataFrame, exam: str) -> dict[str, np.ndarray]:
+    rows = table.filter(pl.col("exam") == exam).to_dicts()
+    return {f"{r['segment'] or ''}/{r['marker']}".lstrip("/"): np.array([r["x_mm"], r["y_mm"], r["z_mm"]]) for r in rows}
+
+
+def names_of_truth(films: Path, out: Path) -> dict[str, dict[str, str]]:
+    """Return by examination the true name of every name that was given."""
+    truth, found = read(films / "truth" / "markers.csv"), read(out / "markers.csv")
+    result = {}
+    for exam in (FIRST, SECOND, THIRD):
+        true = places(truth, exam)
+        result[exam] = {
+            name: min(true, key=lambda t: float(np.linalg.norm(true[t] - place))) for name, place in places(found, exam).items()
+        }
+    return result
+
+
+def exams(out: Path) -> dict[str, tuple[str, str]]:
+    return {r["exam"]: (r["status"], r["reasons"] or "") for r in read(out / "exams.csv").to_dicts()}
+
+
+def test_names_by_segments_are_the_true_ones_in_every_examination(films: Path, hide: Any, tmp_path: Path) -> None:
+    hide()
+    segments = films / "truth" / "segments.csv"
+    assert run_app(["measure", str(films), "-o", str(tmp_path), "--segments", str(segments)]) == 0
+    assert all(status == ("ok", "") for status in exams(tmp_path).values())
+    for names in names_of_truth(films, tmp_path).values():
+        assert len(names) == 11
+        assert all(given == true for given, true in names.items())
+    images = read(tmp_path / "images.csv").filter(pl.col("role") == "object")
+    assert set(images["number"]) == set(names)
+    run = (tmp_path / "run.json").read_text()
+    assert "segments.csv" in run
+
+
+def test_names_without_segments_stay_those_of_the_first_examination(films: Path, hide: Any, tmp_path: Path) -> None:
+    hide((FIRST, 1, "bone/2"), (FIRST, 2, "bone/2"), (SECOND, 1, "implant/1"), (SECOND, 2, "implant/1"))
+    assert run_app(["measure", str(films), "-o", str(tmp_path)]) == 1
+    names = names_of_truth(films, tmp_path)
+    meaning = names[FIRST] | {name: true for name, true in names[SECOND].items() if name not in names[FIRST]}
+    assert sorted(meaning) == [f"P{k:02d}" for k in range(1, 12)]
+    assert len(set(meaning.values())) == 11
+    for given in names.values():
+        assert all(meaning[name] == true for name, true in given.items())
+    assert len(names[THIRD]) == 11
+    assert exams(tmp_path)[FIRST] == ("ok", "")
+    assert exams(tmp_path)[SECOND][0] == "review"  # a marker that the first did not show
+    assert exams(tmp_path)[THIRD] == ("ok", "")  # by now it is known
+    before = (tmp_path / "markers.csv").read_bytes()
+    run_app(["measure", str(films), "-o", str(tmp_path)])  # from the records
+    assert (tmp_path / "markers.csv").read_bytes() == before
+    segments = tmp_path / "segments.csv"
+    assert run_app(["segments", "propose", str(tmp_path), "-o", str(segments)]) == 0
+    (proposed,) = read_segments(segments).values()
+    bodies = [{meaning[marker].split("/")[0] for marker in segment.markers} for segment in proposed]
+    assert sorted(map(sorted, bodies)) == [["bone"], ["implant"]]
+
+
+def test_a_marker_hidden_from_one_focus_is_predicted_at_its_true_place(films: Path, hide: Any, tmp_path: Path) -> None:
+    hide((SECOND, 2, "bone/3"))
+    segments = films / "truth" / "segments.csv"
+    assert run_app(["measure", str(films), "-o", str(tmp_path), "--segments", str(segments)]) == 1
+    found = read(tmp_path / "markers.csv").filter((pl.col("exam") == SECOND) & (pl.col("marker") == "3") & (pl.col("segment") == "bone"))
+    (row,) = found.to_dicts()
+    assert row["flags"] == "one-view;predicted"
+    assert row["n_views"] == 1
+    error = places(found, SECOND)["bone/3"] - places(read(films / "truth" / "markers.csv"), SECOND)["bone/3"]
+    assert (np.abs(error) < [3 * row[f"sd_{axis}_mm"] for axis in "xyz"]).all()
+    assert exams(tmp_path)[SECOND] == ("review", "marker-one-view")
+    image = read(tmp_path / "images.csv").filter((pl.col("exam") == SECOND) & (pl.col("number") == "bone/3"))
+    assert image["focus"].to_list() == [1]
+
+
+def test_segments_of_another_object_are_never_ok(films: Path, hide: Any, tmp_path: Path) -> None:
+    hide()
+    table = read(films / "truth" / "segments.csv").with_columns(pl.col("x_mm") * -1)
+    table.write_csv(tmp_path / "mirrored.csv")
+    assert run_app(["measure", str(films), "-o", str(tmp_path / "out"), "--segments", str(tmp_path / "mirrored.csv")]) == 1
+    assert all(status == "review" and "marker-mismatch" in reasons for status, reasons in exams(tmp_path / "out").values())
+
+
+def rows_of(exam: str, places_mm: np.ndarray, flags: str = "", reasons: str = "") -> Any:
+    """The tables of an examination with markers at places, without images."""
+    markers = [
+        dict.fromkeys(SCHEMAS["markers"])
+        | {"subject": "S", "exam": exam, "segment": "", "marker": f"P{k + 1:02d}", "n_views": 2, "flags": flags}
+        | dict(zip(("x_mm", "y_mm", "z_mm"), place.tolist(), strict=True))
+        | {f"sd_{axis}_mm": 0.01 for axis in "xyz"}
+        for k, place in enumerate(places_mm)
+    ]
+    about = {"subject": "S", "exam": exam, "status": "review" if reasons else "ok", "reasons": reasons, "message": ""}
+    return {"exams": [about], "images": [], "foci": [], "markers": markers}
+
+
+def test_names_given_twice_are_the_same_and_too_few_markers_are_never_named() -> None:
+    body = np.random.default_rng(1).normal(0, 20, (6, 3))
+    exams = [rows_of("1", body), rows_of("2", body[[4, 1]] + 3), rows_of("3", body[:0]), rows_of("4", body[::-1] - 5)]
+    for segments in (None, {"": [Segment("a", tuple("123456"), body)]}):
+        once = follow_up(exams, segments, Limits())
+        twice = follow_up(once, segments, Limits())
+        assert [rows["markers"] for rows in twice] == [rows["markers"] for rows in once]
+        first, few, none, last = once
+        assert first["exams"][0]["status"] == last["exams"][0]["status"] == "ok"
+        assert [row["marker"] for row in last["markers"]] == [row["marker"] for row in first["markers"]][::-1]
+        assert few["exams"][0]["status"] == "review"
+        assert not {row["marker"] for row in few["markers"]} & {row["marker"] for row in first["markers"]}
+        assert none["markers"] == []
+
+
+def test_doubtful_pairs_that_agree_with_the_segment_stay_in_review_and_it_says_so() -> None:
+    body = np.random.default_rng(2).normal(0, 20, (5, 3))
+    (named,) = follow_up([rows_of("1", body + 9, "ambiguous", "pair-ambiguous")], {"S": [Segment("a", tuple("12345"), body)]}, Limits())
+    assert (named["exams"][0]["status"], named["exams"][0]["reasons"]) == ("review", "pair-ambiguous")
+    assert "agree with the constellation" in named["exams"][0]["message"]
+    assert all(row["segment"] == "a" for row in named["markers"])
+
+
+def test_reconstruct_names_points_by_segments(films: Path, tmp_path: Path) -> None:
+    points = read(films / "truth" / "images.csv")
+    objects = {name: str(101 + k) for k, name in enumerate(sorted(points.filter(pl.col("role") == "object")["number"].unique()))}
+    points.filter(pl.col("role") != "unassigned").with_columns(pl.col("number").replace(objects)).write_csv(tmp_path / "points.csv")
+    segments = films / "truth" / "segments.csv"
+    assert rsa_vision.reconstruct(tmp_path / "points.csv", tmp_path / "out", cage="2", segments=segments).count("failed") == 0
+    for names in names_of_truth(films, tmp_path / "out").values():
+        assert len(names) == 11
+        assert all(given == true for given, true in names.items())
+
+
+HEAD = "subject,segment,marker,x_mm,y_mm,z_mm\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("subject,segment,x_mm,y_mm,z_mm\n", ["marker is missing"]),
+        (HEAD, ["no marker"]),
+        (
+            HEAD + "S,a,1,0,0,zero\nS,a,1,nan,0,0\n,b/c,,0,0,0\nS,a\n",
+            ["line 2: z_mm", "line 3: x_mm", "stands there", "slash", "marker is empty", "2 values"],
+        ),
+        (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\n", ["2 markers"]),
+        (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\nS,a,3,20,0,0.1\n", ["in line"]),
+        (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\nS,a,3,0,20,0\nS,a,4,0,20,0.1\n", ["same place"]),
+    ],
+)
+def test_segments_that_cannot_be_used_are_refused_with_every_error(text: str, said: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "segments.csv"
+    path.write_text(text)
+    with pytest.raises(SettingsError) as error:
+        read_segments(path)
+    assert all(part in str(error.value) for part in said)
+
+
+def test_proposals_need_two_examinations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(["segments", "propose", str(tmp_path)]) == 2
+    assert "no results" in capsys.readouterr().err
