@@ -25,6 +25,7 @@ from rsa_vision.tables import SCHEMAS, Row, Rows, split_name
 from rsa_vision.types import Float
 from rsa_vision.verdict import Finding, conclude
 
+UNRELATED: Final = 8  # markers of which not one is found again, nor nearly: another object, not one whose few markers moved
 MOST_EARLIER: Final = 6  # examinations that one is compared with: the first, and the last ones before it
 AXES: Final = ("x_mm", "y_mm", "z_mm")
 
@@ -51,6 +52,7 @@ class _Exam:
     flags: list[int] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     hidden: list[_Hidden] = field(default_factory=list)
+    note: str = ""  # what a reader should know though nothing is wrong
 
 
 def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) -> list[Rows]:
@@ -233,7 +235,9 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
     for a in new:
         used += 1
         exam.names[left[a]] = f"P{used:02d}"
-    if earlier:
+    if earlier and not agreed and not doubtful.any() and len(new) >= UNRELATED:
+        exam.note = f"another object than in the earlier examinations: none of its {len(new)} markers is among theirs"
+    elif earlier:
         known = {name for other in earlier for name in other.names if not split_name(name)[0]}
         exam.findings += _earlier_findings(exam, [left[a] for a in new], [left[a] for a in new if doubtful[a]], known)
     return used
@@ -279,7 +283,9 @@ def _renamed(exam: _Exam) -> Rows:
         markers.append(_predicted(exam.rows["exams"][0], hidden))
         for index, (focus, ray) in hidden.images.items():
             images[index] = _seen(images[index], hidden, focus, ray)
-    return {**exam.rows, "exams": [_judged(exam.rows["exams"][0], exam.findings)], "images": images, "markers": markers}
+    row = _judged(exam.rows["exams"][0], exam.findings)
+    row["message"] = " | ".join(filter(None, [row["message"], exam.note]))
+    return {**exam.rows, "exams": [row], "images": images, "markers": markers}
 
 
 def _predicted(exam: Row, hidden: _Hidden) -> Row:
