@@ -9,6 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from rsa_vision.api_motion import growth, motion, precision, write_motion
 from rsa_vision.batch import Outcome, Task, run
 from rsa_vision.errors import FilmError, UsageError
 from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
@@ -19,6 +20,8 @@ from rsa_vision.study_files import natural_key
 
 if TYPE_CHECKING:
     import polars as pl
+
+__all__ = ["Summary", "Watcher", "demo", "detect", "growth", "measure", "motion", "precision", "reconstruct", "report"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +121,7 @@ def measure(
     tasks = [Task(files, settled, geometry, depends_on, out, redo) for files in grouping.exams]
     outcomes = run(tasks, jobs, timeout_s, lambda outcome: watch(outcome, len(tasks)) if watch else None)
     write_tables(out, (outcome.rows for outcome in outcomes))
+    write_motion(out, settled)
     options = {"method": method, "jobs": jobs, "redo": redo, "timeout_s": timeout_s}
     record = _record("measure", started, folder, study_file, settled, about) | {
         "options": options,
@@ -184,6 +188,7 @@ def reconstruct(
         rows = examination_rows(subject, exam, [points.name], result, perf_counter() - began)
         outcomes.append(Outcome(subject, exam, rows))
     write_tables(out, (outcome.rows for outcome in outcomes))
+    write_motion(out, settled)
     record = _record("reconstruct", started, points, study_file, settled, {"cage": cage_content(loaded)})
     _finish(out, record | {"inputs": [{"path": str(points.resolve()), "sha256": file_sha256(points)}]})
     return Summary(out, tuple(outcomes))

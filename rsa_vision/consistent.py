@@ -31,11 +31,11 @@ def _consistent(segment: Segment, tolerance_mm: float) -> Bool:
     """Return which markers are seen in every examination that shows the segment, and hold their mutual distances in all of them."""
     present = segment.present
     shown = present.any(axis=1)
-    subset: Bool = present[shown].all(axis=0) & shown.any()
+    subset: Bool = np.all(present[shown], axis=0) & shown.any()
     at, exams = np.flatnonzero(subset), np.flatnonzero(shown)
     if len(at) > 1 and len(exams) > 1:
         position, covariance = segment.position_mm[np.ix_(exams, at)], segment.covariance_mm2[np.ix_(exams, at)]
         change, sd = distance_changes(position[:1], position[1:], covariance[:1], covariance[1:])
-        broken: Bool = (np.abs(change) > np.maximum(tolerance_mm, DISTANCE_SIGMA * sd)).any(axis=0)
+        broken: Bool = np.any(np.abs(change) > np.maximum(tolerance_mm, DISTANCE_SIGMA * sd), axis=0)
         subset[at[loose(broken)]] = False
     return subset

@@ -75,7 +75,9 @@ def compare_lengths(source_mm: Float, target_mm: Float, source_mm2: Float, targe
     difference = (lengths[1] - lengths[0]) * UM
     rmsv = float(np.sqrt((difference**2).mean())) if len(difference) else np.nan
     s0, scale, form = _hallert(source_mm, target_mm)
-    return Growth(first, second, *lengths, difference, np.sqrt(variances[0] + variances[1]) * UM, rmsv, s0 * UM, scale * PPM, form)
+    return Growth(
+        first, second, lengths[0], lengths[1], difference, np.sqrt(variances[0] + variances[1]) * UM, rmsv, s0 * UM, scale * PPM, form
+    )
 
 
 def _hallert(source: Float, target: Float) -> tuple[float, float, str]:

@@ -111,11 +111,11 @@ def _rows(series: Sequence[Series], pairs: Sequence[Pairs], first: Int, referenc
         names = [segment.name for segment in one.segments]
         wanted = reference if reference is not None else (names[0] if names else "")
         for j, name in enumerate(names):
-            moved = at + j
-            parts.append((i, moved, int(first[moved]), ABSOLUTE, ""))
+            own = at + j
+            parts.append((i, own, int(first[own]), ABSOLUTE, ""))
             others = dict.fromkeys([wanted, *names[max(j - 1, 0) : j]])
             parts += [
-                (i, moved, int(first[moved]), int(first[at + names.index(other)]) if other in names else UNKNOWN, other)
+                (i, own, int(first[own]), int(first[at + names.index(other)]) if other in names else UNKNOWN, other)
                 for other in others
                 if other != name
             ]
@@ -250,7 +250,7 @@ def _fill(columns: Columns, at: Int, fits: Fits, moved: Int, fixed: Int, number:
     put("mtpm_high_mm", total.high_mm)
     column = group.column[place, total.marker]
     columns["mtpm_marker"][at] = [segments[s].markers[c] for s, c in zip(segment.tolist(), column.tolist(), strict=True)]
-    codes: Int = np.where(undefined, BIT["screw-undefined"], 0) | np.where(singular, BIT["euler-singular"], 0)
+    codes: Int = undefined.astype(np.int64) * BIT["screw-undefined"] + singular.astype(np.int64) * BIT["euler-singular"]
     return codes
 
 

@@ -139,7 +139,7 @@ def _fit_block(
     if chosen is not None:
         position = np.where(chosen[:, None, :, None], position, np.nan)
         duplicate, predicted = duplicate & chosen[:, None], predicted & chosen[:, None]
-    present: Bool = np.isfinite(position).all(axis=3)
+    present: Bool = np.all(np.isfinite(position), axis=3)
     a, b = pairs.T
     seen_a, seen_b = present[:, a], present[:, b]
     common = seen_a & seen_b

@@ -68,7 +68,7 @@ class Segment:
     @property
     def present(self) -> Bool:
         """Which markers have coordinates, shape (E, n)."""
-        result: Bool = np.isfinite(self.position_mm).all(axis=2)
+        result: Bool = np.all(np.isfinite(self.position_mm), axis=2)
         return result
 
 

@@ -39,6 +39,7 @@ class Limits(Frozen):
     e_rb_mm: Annotated[float, Field(gt=0)] = 0.35  # ISO 16087
     condition_number: Annotated[float, Field(gt=0)] = 120.0  # guideline
     stable_mm: Annotated[float, Field(gt=0)] = 0.35  # markers whose distances change more are not of one rigid body
+    continuous_mm: Annotated[float, Field(gt=0)] = 0.2  # MTPM a year after the first: continuous migration (Ryd 1995)
     false_detections_per_film: Annotated[float, Field(gt=0)] = 0.1  # expected false marker images on a film
 
 
