@@ -16,6 +16,7 @@ from rsa_vision.motion_tables import (
     growth_tables,
     motion_table,
     precision_table,
+    remove_motion_tables,
     rigidity_table,
     write_motion_tables,
 )
@@ -106,6 +107,7 @@ def write_motion(out: Path, study: Study) -> MotionSummary | None:
         Folder with ``markers.csv`` and ``exams.csv``.
     study : Study
     """
+    remove_motion_tables(out)  # of an earlier run with other markers
     given = read_markers(out, may_be_empty=True)
     if given.unnamed == len(given.markers):
         return None

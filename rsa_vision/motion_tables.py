@@ -233,6 +233,13 @@ def write_motion_tables(out: Path, tables: Mapping[str, pl.DataFrame]) -> None:
         write_atomic(out / "results.parquet" / f"{name}.parquet", parquet_bytes(table))
 
 
+def remove_motion_tables(out: Path) -> None:
+    """Remove the tables of motion, growth and precision that a folder holds."""
+    for name in MOTION_SCHEMAS:
+        (out / f"{name}.csv").unlink(missing_ok=True)
+        (out / "results.parquet" / f"{name}.parquet").unlink(missing_ok=True)
+
+
 def read_motion_tables(out: Path) -> dict[str, pl.DataFrame]:
     """Read those tables of motion that a folder holds."""
     found = {}

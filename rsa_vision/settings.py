@@ -90,6 +90,7 @@ class Study(Frozen):
     calibration: dict[int, Path] = {}
     motion: Motion = Motion()
     limits: Limits = Limits()
+    report: dict[str, str] = {}
 
     @model_validator(mode="after")
     def _one_frame(self) -> Self:

@@ -205,3 +205,27 @@ def test_ten_thousand_motions_take_a_second(tmp_path: Path) -> None:
     found = motions(series, Motion(), Limits(condition_number=1e4))
     assert time.process_time() - started < 2.0  # 0.7 s where nothing else runs
     assert len(found["status"]) == 10_000
+
+
+def test_a_run_with_known_segments_ends_with_motion_in_its_report(markers: Path, tmp_path: Path) -> None:
+    from rsa_vision import api
+    from rsa_vision.settings import Study
+    from rsa_vision.store import write_run
+    from rsa_vision.tables import SCHEMAS, frame
+
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in SCHEMAS:
+        frame([], SCHEMAS[name]).write_csv(out / f"{name}.csv")
+    study = Study.model_validate({"motion": {"reference": "bone"}, "report": {"implant": "a <stem>"}})
+    assert api.write_motion(out, study) is None
+    assert not (out / "motion.csv").exists()
+    (out / "markers.csv").write_bytes(markers.read_bytes())
+    assert api.write_motion(out, study) is not None
+    frame([], SCHEMAS["markers"]).write_csv(out / "markers.csv")
+    write_run(out, {"settings": study.model_dump(mode="json")})
+    page = api.report(out).read_text()
+    assert page.count("over time") == 7  # stem against bone: six parameters and MTPM
+    assert "a &lt;stem&gt;" in page
+    assert "36 motions: 36 ok" in page
+    assert "set posture in [report]" in page
