@@ -116,7 +116,7 @@ def write_motion(out: Path, study: Study) -> MotionSummary | None:
 
 def _write(given: MarkerFile, out: Path, study: Study) -> MotionSummary:
     series = make_series(given.markers, given.status)
-    table = motion_table(series, study.motion, study.limits)
+    table = motion_table(series, study.motion, study.limits, shared_errors=given.shared_errors)
     tables = {"motion": table, "rigidity": rigidity_table(series, study.limits.stable_mm), "motion_groups": group_table(table, series)}
     write_motion_tables(out, tables)
     return MotionSummary(out, table, given.unnamed)

@@ -54,7 +54,9 @@ class _Rows:
     reference: list[str]
 
 
-def motions(series: Sequence[Series], settings: Motion, limits: Limits, pairs_of: PairsOf = follow_up_pairs) -> Columns:
+def motions(
+    series: Sequence[Series], settings: Motion, limits: Limits, pairs_of: PairsOf = follow_up_pairs, *, shared_errors: bool = False
+) -> Columns:
     """Return every motion of every segment.
 
     Parameters
@@ -65,6 +67,9 @@ def motions(series: Sequence[Series], settings: Motion, limits: Limits, pairs_of
     limits : Limits
     pairs_of : callable, optional
         Which examinations to compare; default: the first with each, and each with the next.
+    shared_errors : bool
+        The covariances hold errors that all markers of an examination share, such as those of the foci. How much is not told, so absolute
+        translations are given the errors that they would have if all were shared. In relative motion shared errors cancel.
 
     Returns
     -------
@@ -80,10 +85,10 @@ def motions(series: Sequence[Series], settings: Motion, limits: Limits, pairs_of
     each = [pairs[i] for i in owner]
     fits = fit_segments(segments, each, limits)
     rows = _rows(placed, pairs, fits.first, settings.reference)
-    found = _results(fits, rows, segments)
+    found = _results(fits, rows, segments, shared_errors)
     subsets = consistent_subsets(segments, limits.stable_mm)
     others = None if all(subset.all() for subset in subsets) else fit_segments(segments, each, limits, subsets)
-    beside = _results(others, rows, segments) if others else found
+    beside = _results(others, rows, segments, shared_errors) if others else found
     columns = _keys(placed, segments, rows) | found
     around = _exam_codes(placed, rows, frames) | np.where(rows.fixed == UNKNOWN, BIT["reference-unknown"], 0)
     codes = columns.pop("codes") | around
@@ -156,7 +161,7 @@ def _exam_codes(series: Sequence[Series], rows: _Rows, frames: Sequence[Float]) 
     return result
 
 
-def _results(fits: Fits, rows: _Rows, segments: Sequence[Segment]) -> Columns:
+def _results(fits: Fits, rows: _Rows, segments: Sequence[Segment], shared_errors: bool) -> Columns:
     """Return the numbers of every motion, and its codes."""
     moved, fixed = rows.moved, rows.fixed
     codes = fits.codes[moved].copy()
@@ -173,7 +178,7 @@ def _results(fits: Fits, rows: _Rows, segments: Sequence[Segment]) -> Columns:
     groups = fits.group[moved]
     for number in np.unique(groups[whole]).tolist():
         at = np.flatnonzero(whole & (groups == number))
-        codes[at] |= _fill(columns, at, fits, moved[at], fixed[at], number, segments, rows.segment[at])
+        codes[at] |= _fill(columns, at, fits, moved[at], fixed[at], number, segments, rows.segment[at], shared_errors)
     finite = fits.group[moved] >= 0
     for axis, name in enumerate(AXES):
         columns[f"cog_{name}_mm"] = fits.before_mm[moved, axis]
@@ -193,7 +198,17 @@ def _results(fits: Fits, rows: _Rows, segments: Sequence[Segment]) -> Columns:
     return columns
 
 
-def _fill(columns: Columns, at: Int, fits: Fits, moved: Int, fixed: Int, number: int, segments: Sequence[Segment], segment: Int) -> Int:
+def _fill(
+    columns: Columns,
+    at: Int,
+    fits: Fits,
+    moved: Int,
+    fixed: Int,
+    number: int,
+    segments: Sequence[Segment],
+    segment: Int,
+    shared_errors: bool,
+) -> Int:
     """Compute the motions of one group of fits into the rows `at`, and return their codes."""
     group, place = fits.groups[number], fits.place[moved]
     rotation, before, after = fits.rotation[moved], fits.before_mm[moved], fits.after_mm[moved]
@@ -211,6 +226,8 @@ def _fill(columns: Columns, at: Int, fits: Fits, moved: Int, fixed: Int, number:
         rotation = rotation.copy()
         rotation[relative] = back @ rotation[relative]
     covariance = transfer @ fits.covariance[moved] @ transfer.transpose(0, 2, 1) + covariance_fixed
+    if shared_errors:
+        covariance[~relative, 3:6, 3:6] += fits.shared_mm2[moved[~relative]]
     angles = euler_from_matrix(rotation)
     screws = find_screws(rotation, shift, before)
     sd_angles = _sd(euler_jacobian(angles), covariance[:, :3, :3])

@@ -36,6 +36,8 @@ class MarkerFile:
         Where results go by default.
     unnamed : int
         Rows without a segment.
+    shared_errors : bool
+        The covariances hold errors of the foci (``foci.csv`` tells them), which all markers of an examination share.
     """
 
     markers: MarkerTable
@@ -43,6 +45,7 @@ class MarkerFile:
     path: Path
     folder: Path
     unnamed: int
+    shared_errors: bool
 
 
 def read_markers(source: Path, *, standard: bool = False, may_be_empty: bool = False) -> MarkerFile:
@@ -80,7 +83,8 @@ def read_markers(source: Path, *, standard: bool = False, may_be_empty: bool = F
     markers = _check(path, table, standard)
     status = _read_status(source / "exams.csv") if source.is_dir() else {}
     folder = source if source.is_dir() else path.parent
-    return MarkerFile(markers, status, path, folder, int((markers.segment == "").sum()))
+    shared = source.is_dir() and _has_uncertain_foci(source / "foci.csv")
+    return MarkerFile(markers, status, path, folder, int((markers.segment == "").sum()), shared)
 
 
 def _read_csv(path: Path) -> pl.DataFrame:
@@ -164,3 +168,11 @@ def _read_status(path: Path) -> dict[tuple[str, str], str]:
     if not {"subject", "exam", "status"} <= set(table.columns):
         raise PointsError(f"{path}: missing columns: subject, exam and status are needed")
     return {(subject, exam): status for subject, exam, status in table.select("subject", "exam", "status").iter_rows() if exam}
+
+
+def _has_uncertain_foci(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    table = _read_csv(path)
+    deviations = [table[name].cast(pl.Float64, strict=False) for name in DEVIATIONS if name in table.columns]
+    return any((values > 0).any() for values in deviations)

@@ -58,6 +58,8 @@ class Fits:
         Centres of gravity.
     covariance : ndarray of shape (R, 9, 9)
         Of (rotation, centre of gravity before, after).
+    shared_mm2 : ndarray of shape (R, 3, 3)
+        What the covariance of the translation of the centre of gravity would gain if markers of one examination had all errors in common.
     e_rb_mm, mean_error_mm, condition_number, birge : ndarray of shape (R,)
         Root mean square and mean of the residual distances; 1/m; factor on the stated errors.
     count : ndarray of int, shape (R,)
@@ -77,6 +79,7 @@ class Fits:
     before_mm: Float
     after_mm: Float
     covariance: Float
+    shared_mm2: Float
     e_rb_mm: Float
     mean_error_mm: Float
     condition_number: Float
@@ -114,7 +117,7 @@ def fit_segments(segments: Sequence[Segment], pairs: Sequence[Pairs], limits: Li
     empty = np.full(total, np.nan)
     fits = Fits(
         np.full((total, 3, 3), np.nan), np.full((total, 3), np.nan), np.full((total, 3), np.nan), np.full((total, 9, 9), np.nan),
-        empty, empty.copy(), empty.copy(), np.ones(total), np.zeros(total, np.int64), np.zeros(total, np.int64),
+        np.zeros((total, 3, 3)), empty, empty.copy(), empty.copy(), np.ones(total), np.zeros(total, np.int64), np.zeros(total, np.int64),
         np.full(total, None, object), np.full(total, -1), np.full(total, -1), (), first[:-1],
     )  # fmt: skip
     groups: list[Group] = []
@@ -212,6 +215,8 @@ def _fit_group(
     fits.after_mm[rows] = np.where(determined, rigid.target_cog_mm, np.nan)
     fits.birge[rows] = birge
     fits.covariance[rows] = np.where(determined[..., None], found.covariance, np.nan)
+    own = found.marker_mm2[..., :3, :3] + found.marker_mm2[..., 3:, 3:]
+    fits.shared_mm2[rows] = own.mean(axis=1) * (1 - 1 / size)
     fits.group[rows], fits.place[rows] = np.where(determined[:, 0], number, -1), np.arange(len(rows))
     return Group(rigid.centred_mm, found.gain @ found.marker_mm2[..., :3], found.marker_mm2[..., :3, :3], columns)
 

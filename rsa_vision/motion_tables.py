@@ -71,9 +71,9 @@ STANDARD: Final = "standard"
 UM: Final = 1000.0
 
 
-def motion_table(series: Sequence[Series], settings: Motion, limits: Limits) -> pl.DataFrame:
+def motion_table(series: Sequence[Series], settings: Motion, limits: Limits, *, shared_errors: bool = False) -> pl.DataFrame:
     """Return ``motion.csv`` of subjects."""
-    columns = motions(series, settings, limits)
+    columns = motions(series, settings, limits, shared_errors=shared_errors)
     first = {(one.subject, exam): day for one in series for exam, day in zip(one.exams, one.days.tolist(), strict=True)}
     start = np.array([first[key] for key in zip(columns["subject"], columns["exam_from"], strict=True)], float)
     return _table(columns | {"continuous": _continuous(columns, start, limits.continuous_mm)}, MOTION)

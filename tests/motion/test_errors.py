@@ -9,7 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
-from rsa_vision.settings import Limits
+from rsa_vision.kinema import motions
+from rsa_vision.series import make_series
+from rsa_vision.settings import Limits, Motion
 
 from .bodies import Subject, analyse, subject, table, vector
 
@@ -88,3 +90,23 @@ def test_residuals_larger_than_stated_errors_make_these_larger() -> None:
     error = np.array([vector(found, "t?_mm", row) - vector(exact, "t?_mm", 0) for row in range(300)])
     sd = np.array([vector(found, "sd_t?_mm", row) for row in range(300)])
     assert 0.9 < np.sqrt(np.mean((error / sd) ** 2)) < 1.15
+
+
+def test_errors_that_all_markers_share_are_within_what_is_stated_for_absolute_and_cancel_in_relative_motion() -> None:
+    rng = np.random.default_rng(7)
+    one = subject(rng, exams=2, segments=("bone", "stem"), markers=6, angle_deg=1, shift_mm=1)
+    n, own, common = 400, 0.02, 0.06
+    noisy = table([one] * n, rng, np.eye(3) * own**2)
+    exams = {key: rng.normal(0, common, 3) for key in {*zip(noisy.subject, noisy.exam, strict=True)}}
+    noisy.position_mm[:] += [exams[key] for key in zip(noisy.subject, noisy.exam, strict=True)]
+    noisy.covariance_mm2[:] += np.eye(3) * common**2
+    exact = analyse(table([one]), limits=WIDE)
+    found = motions(make_series(noisy), Motion(), WIDE, shared_errors=True)
+    whole = np.sqrt((common**2 + own**2 / 6) / (common**2 + own**2))  # a little conservative
+    near = 4 / np.sqrt(2 * n)  # standard errors of a root mean square
+    cancelled = own / np.hypot(own, common)
+    for reference, low, high in (("", whole - near, whole + near), ("bone", cancelled * (1 - near), cancelled * (1 + near))):
+        at, truth = rows_of(found, "stem", reference), rows_of(exact, "stem", reference)[0]
+        for name in ("tx_mm", "ty_mm", "tz_mm"):
+            ratio = (found[name][at].astype(float) - exact[name][truth]) / found[f"sd_{name}"][at].astype(float)
+            assert low < np.sqrt(np.mean(ratio**2)) < high, (reference, name)
