@@ -18,6 +18,7 @@ PLACE: Final = ("x_mm", "y_mm", "z_mm")
 DEVIATIONS: Final = ("sd_x_mm", "sd_y_mm", "sd_z_mm")
 PRODUCTS: Final = {"cov_xy_mm2": (0, 1), "cov_xz_mm2": (0, 2), "cov_yz_mm2": (1, 2)}
 MOST_ERRORS: Final = 20  # of a wrong file that are printed
+LARGEST: Final = 1e6  # mm; nothing in a radiograph is a kilometre away
 ROUNDING: Final = 1e-6  # of a covariance in print
 
 
@@ -125,9 +126,9 @@ def _check(path: Path, table: pl.DataFrame, standard: bool) -> MarkerTable:
     def number(name: str) -> Float:
         given = table[name].fill_null("")
         values = given.cast(pl.Float64, strict=False)
-        wrong = ((values.is_null() & (given != "")) | values.is_infinite().fill_null(False)).to_numpy()
-        problems.extend((int(i), f"{name} is {given[int(i)]!r}, not a number") for i in np.flatnonzero(wrong))
-        return values.fill_null(np.nan).to_numpy().astype(np.float64)
+        wrong = ((values.is_null() & (given != "")) | (values.is_not_nan() & (values.abs() > LARGEST)).fill_null(False)).to_numpy()
+        problems.extend((int(i), f"{name} is {given[int(i)]!r}, not a number of mm") for i in np.flatnonzero(wrong))
+        return np.where(wrong, np.nan, values.fill_null(np.nan).to_numpy())
 
     names = [text("subject"), text("exam", not standard), text("segment"), text("marker", True)]
     position = np.stack([number(name) for name in PLACE], axis=1)

@@ -109,6 +109,7 @@ def test_tables_of_other_programs_are_read_with_their_separator(markers: Path, s
         ("exam,segment,marker,x_mm,y_mm,z_mm\n", "no marker in it"),
         ("exam,segment,marker,x_mm,y_mm,z_mm\n1,a,1,0,zero,0\n", "line 2: y_mm is 'zero', not a number"),
         ("exam,segment,marker,x_mm,y_mm,z_mm\n1,a,1,0,inf,0\n", "line 2: y_mm is 'inf', not a number"),
+        ("exam,segment,marker,x_mm,y_mm,z_mm\n1,a,1,0,1e300,0\n", "line 2: y_mm is '1e300', not a number of mm"),
         ("exam,segment,marker,x_mm,y_mm,z_mm\n,a,,0,0,0\n", "line 2: marker is empty"),
         ("exam,segment,marker,x_mm,y_mm,z_mm\n1,,1,0,0,0\n", "no marker has a segment"),
         ("exam,segment,marker,x_mm,x_mm,z_mm\n1,a,1,0,0,0\n", "stand twice: x_mm"),
