@@ -108,7 +108,7 @@ def write_motion(out: Path, study: Study) -> MotionSummary | None:
     study : Study
     """
     remove_motion_tables(out)  # of an earlier run with other markers
-    given = read_markers(out, may_be_empty=True)
+    given = read_markers(out, own=True)
     if given.unnamed == len(given.markers):
         return None
     return _write(given, out, study)

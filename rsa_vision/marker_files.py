@@ -49,7 +49,7 @@ class MarkerFile:
     shared_errors: bool
 
 
-def read_markers(source: Path, *, standard: bool = False, may_be_empty: bool = False) -> MarkerFile:
+def read_markers(source: Path, *, standard: bool = False, own: bool = False) -> MarkerFile:
     """Read a table of markers.
 
     Parameters
@@ -60,8 +60,9 @@ def read_markers(source: Path, *, standard: bool = False, may_be_empty: bool = F
         (with decimal commas or points) or a tab. Empty or NaN coordinates mean *not determined*.
     standard : bool
         The columns subject, exam and segment may be missing.
-    may_be_empty : bool
-        No marker at all is no error.
+    own : bool
+        The table of a run that has just ended: no marker is no error, and values that cannot be used are left out, so that a marker far
+        off does not end the run.
 
     Returns
     -------
@@ -79,9 +80,9 @@ def read_markers(source: Path, *, standard: bool = False, may_be_empty: bool = F
         what = "no markers.csv in it; measure the films first" if source.is_dir() else "no such file or folder"
         raise UsageError(f"{source}: {what}, or give a CSV file of markers")
     table = _read_csv(path)
-    if not len(table) and not may_be_empty:
+    if not len(table) and not own:
         raise PointsError(f"{path}: there is no marker in it")
-    markers = _check(path, table, standard)
+    markers = _check(path, table, standard, own)
     status = _read_status(source / "exams.csv") if source.is_dir() else {}
     folder = source if source.is_dir() else path.parent
     shared = source.is_dir() and _has_uncertain_foci(source / "foci.csv")
@@ -110,7 +111,7 @@ def _read_csv(path: Path) -> pl.DataFrame:
     return table
 
 
-def _check(path: Path, table: pl.DataFrame, standard: bool) -> MarkerTable:
+def _check(path: Path, table: pl.DataFrame, standard: bool, own: bool) -> MarkerTable:
     free = ("subject", "exam", "segment") if standard else ("subject",)
     wanted = [name for name in ("subject", "exam", "segment", "marker", *PLACE) if name not in free]
     if missing := [name for name in wanted if name not in table.columns]:
@@ -139,11 +140,11 @@ def _check(path: Path, table: pl.DataFrame, standard: bool) -> MarkerTable:
         for name, (i, j) in PRODUCTS.items():
             if name in table.columns:
                 covariance[:, i, j] = covariance[:, j, i] = np.nan_to_num(number(name))
-        problems += [
-            (int(i), "the standard deviations and covariances are no covariance") for i in np.flatnonzero(~_valid(covariance, deviation))
-        ]
+        valid = _valid(covariance, deviation)
+        problems += [(int(i), "the standard deviations and covariances are no covariance") for i in np.flatnonzero(~valid)]
+        covariance[~valid] = np.nan
         covariance[~(deviation > 0).all(axis=1)] = np.nan  # 0 stands for "not known": no marker is exact
-    if problems:
+    if problems and not own:
         lines = [f"  line {row + 2}: {problem}" for row, problem in sorted(problems)]
         more = [f"  and {len(lines) - MOST_ERRORS} more"] if len(lines) > MOST_ERRORS else []
         raise PointsError(f"{path}: wrong values\n" + "\n".join(lines[:MOST_ERRORS] + more))

@@ -223,6 +223,13 @@ def test_a_run_with_known_segments_ends_with_motion_in_its_report(markers: Path,
     assert not (out / "motion.csv").exists()
     (out / "markers.csv").write_bytes(markers.read_bytes())
     assert api.write_motion(out, study) is not None
+    far = pl.read_csv(markers, infer_schema=False).with_columns(y_mm=pl.when(pl.col("marker") == "1").then(pl.lit("1e9")).otherwise("y_mm"))
+    far.write_csv(out / "markers.csv")
+    lost = api.write_motion(out, study)  # a marker far off does not end a run
+    assert lost is not None
+    assert all("marker-missing" in reasons for reasons in lost.table["reasons"])
+    (out / "markers.csv").write_bytes(markers.read_bytes())
+    api.write_motion(out, study)
     frame([], SCHEMAS["markers"]).write_csv(out / "markers.csv")
     write_run(out, {"settings": study.model_dump(mode="json")})
     page = api.report(out).read_text()
