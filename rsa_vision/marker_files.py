@@ -57,7 +57,8 @@ def read_markers(source: Path, *, standard: bool = False, own: bool = False) -> 
     source : Path
         A folder of results, or a CSV file with the columns exam, segment, marker, x_mm, y_mm, z_mm. Optional: subject, sd_x_mm ..,
         cov_xy_mm2 .., flags (``predicted`` markers are not used); other columns are ignored. The separator may be a comma, a semicolon
-        (with decimal commas or points) or a tab. Empty or NaN coordinates mean *not determined*.
+        (with decimal commas or points) or a tab. Empty or NaN coordinates mean *not determined*. A table with a row for each frame and the
+        columns NAME_X, NAME_Y, NAME_Z (as XMALab exports points) is read, too: frames are examinations, NAME may be ``segment/marker``.
     standard : bool
         The columns subject, exam and segment may be missing.
     own : bool
@@ -80,6 +81,7 @@ def read_markers(source: Path, *, standard: bool = False, own: bool = False) -> 
         what = "no markers.csv in it; measure the films first" if source.is_dir() else "no such file or folder"
         raise UsageError(f"{source}: {what}, or give a CSV file of markers")
     table = _read_csv(path)
+    table = _long(table)
     if not len(table) and not own:
         raise PointsError(f"{path}: there is no marker in it")
     markers = _check(path, table, standard, own)
@@ -109,6 +111,25 @@ def _read_csv(path: Path) -> pl.DataFrame:
         numbers = [name for name in table.columns if name in (*PLACE, *DEVIATIONS, *PRODUCTS)]
         table = table.with_columns(pl.col(numbers).str.replace(",", ".", literal=True))
     return table
+
+
+def _long(table: pl.DataFrame) -> pl.DataFrame:
+    """Return a table with a row for each frame and the columns ``NAME_X``, ``NAME_Y``, ``NAME_Z`` as one with a row for each marker.
+
+    XMALab and others write points so. The number of the frame is the examination, ``segment/marker`` in NAME tells the segment.
+    """
+    triples = {name[:-2]: [f"{name[:-2]}{end}" for end in (name[-2:], "_Y", "_Z")] for name in table.columns if name.endswith("_X")}
+    whole = {name: columns for name, columns in triples.items() if set(columns) <= set(table.columns)}
+    if "marker" in table.columns or not whole:
+        return table
+    exams = [str(k + 1) for k in range(len(table))]
+    parts = [
+        pl.DataFrame({"exam": exams, "segment": name.rpartition("/")[0], "marker": name.rpartition("/")[2]}).with_columns(
+            table[column].alias(target) for column, target in zip(columns, PLACE, strict=True)
+        )
+        for name, columns in whole.items()
+    ]
+    return pl.concat(parts)
 
 
 def _check(path: Path, table: pl.DataFrame, standard: bool, own: bool) -> MarkerTable:

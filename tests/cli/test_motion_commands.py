@@ -237,3 +237,17 @@ def test_a_run_with_known_segments_ends_with_motion_in_its_report(markers: Path,
     assert "a &lt;stem&gt;" in page
     assert "36 motions: 36 ok" in page
     assert "set posture in [report]" in page
+
+
+def test_a_table_with_a_row_for_each_frame_is_read_as_xmalab_writes_it(markers: Path) -> None:
+    long = pl.read_csv(markers, schema_overrides={"exam": pl.String}).filter(pl.col("subject") == "S001")
+    frames = []
+    for _, exam in long.group_by("exam", maintain_order=True):
+        names = [f"{row['segment']}/{row['marker']}" for row in exam.to_dicts()]
+        frames.append({f"{name}_{a.upper()}": exam[f"{a}_mm"][k] for k, name in enumerate(names) for a in "xyz"})
+    wide = markers.with_name("wide.csv")
+    pl.DataFrame(frames).write_csv(wide)
+    found, expected = rsa_vision.motion(wide).table, rsa_vision.motion(markers).table.filter(pl.col("subject") == "S001")
+    assert set(found["exam_to"]) == {"2", "3"}
+    assert np.allclose(found["tx_mm"], expected["tx_mm"])
+    assert np.allclose(found["mtpm_mm"], expected["mtpm_mm"])
