@@ -9,6 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from rsa_vision.api_motion import growth, motion, precision, write_motion
 from rsa_vision.batch import Outcome, Task, run
 from rsa_vision.errors import FilmError, UsageError
 from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from rsa_vision.proposal import Proposal
+__all__ = ["Summary", "Watcher", "demo", "detect", "growth", "measure", "motion", "precision", "propose_segments", "reconstruct", "report"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +125,7 @@ def measure(
     outcomes = run(tasks, jobs, timeout_s, lambda outcome: watch(outcome, len(tasks)) if watch else None)
     outcomes = _followed_up(outcomes, known, settled)
     write_tables(out, (outcome.rows for outcome in outcomes))
+    write_motion(out, settled)
     options = {"method": method, "segments": _hashed(segments), "jobs": jobs, "redo": redo, "timeout_s": timeout_s}
     record = _record("measure", started, folder, study_file, settled, about) | {
         "options": options,
@@ -200,6 +203,7 @@ def reconstruct(
     if known is not None:  # names that somebody gave stand unless the segments are to give them
         outcomes = _followed_up(outcomes, known, settled)
     write_tables(out, (outcome.rows for outcome in outcomes))
+    write_motion(out, settled)
     record = _record("reconstruct", started, points, study_file, settled, {"cage": cage_content(loaded)})
     inputs = [{"path": str(points.resolve()), "sha256": file_sha256(points)}]
     _finish(out, record | {"options": {"segments": _hashed(segments)}, "inputs": inputs})

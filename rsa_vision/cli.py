@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
+from rsa_vision import cli_motion
+
 if TYPE_CHECKING:
     from rsa_vision.api import Summary
     from rsa_vision.batch import Outcome
@@ -27,6 +29,8 @@ cage_app = typer.Typer(help="Built-in cages, drawings of cages, checks of cage f
 app.add_typer(cage_app, name="cage")
 segments_app = typer.Typer(help="Known segments.", no_args_is_help=True)
 app.add_typer(segments_app, name="segments")
+
+cli_motion.register(app)
 
 INTERRUPTED = 130  # as shells report Ctrl-C
 Result = TypeVar("Result")

@@ -47,7 +47,7 @@ class CalibrationError(RsaError):
 
 
 class PointsError(RsaError):
-    """A table of image coordinates that lacks columns or holds impossible values."""
+    """A table of image coordinates or markers that lacks columns or holds impossible values."""
 
     code: ClassVar[str] = "points-invalid"
 

@@ -13,6 +13,7 @@ import polars as pl
 
 from rsa_vision.cages import Cage
 from rsa_vision.flags import REASONS
+from rsa_vision.report_motion import motion_section
 from rsa_vision.store import picture_path, read_record, read_run, read_tables, record_path, write_atomic
 from rsa_vision.tables import Row
 from rsa_vision.types import Float
@@ -61,6 +62,7 @@ def write_report(out: Path) -> Path:
         colours=COLOURS,
         all_pictured=len(pictured) == len(exams),
         limits=run.get("settings", {}).get("limits", {}),
+        motion=motion_section(out, run.get("settings", {})),
     )
     path = out / "report.html"
     write_atomic(path, page.encode())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -15,6 +15,7 @@ Orientation = Literal["upright", "any", "mirrored"]
 FilmMode = Literal["shared", "separate"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
+ORTHONORMAL: Final = 1e-3  # how well the axes of an anatomical frame must be at right angles
 
 
 class Frozen(BaseModel):
@@ -37,14 +38,42 @@ class Limits(Frozen):
     posterior: Annotated[float, Field(gt=0.5, lt=1)] = 0.999  # an identity below it is ambiguous
     e_rb_mm: Annotated[float, Field(gt=0)] = 0.35  # ISO 16087
     condition_number: Annotated[float, Field(gt=0)] = 120.0  # guideline
+    stable_mm: Annotated[float, Field(gt=0)] = 0.35  # markers whose distances change more are not of one rigid body
+    continuous_mm: Annotated[float, Field(gt=0)] = 0.2  # MTPM a year after the first: continuous migration (Ryd 1995)
     false_detections_per_film: Annotated[float, Field(gt=0)] = 0.1  # expected false marker images on a film
 
 
+class Axes(Frozen):
+    """An anatomical frame through markers, each ``segment/marker``: y points from the first to the second, x as nearly as it can."""
+
+    x: tuple[str, str]
+    y: tuple[str, str]
+
+
 class Motion(Frozen):
-    """Settings of the motion analysis."""
+    """Settings of the motion analysis.
+
+    ``rotation`` has the anatomical axes (x medial, y proximal, z anterior of a right limb) as rows, in the frame of the cage.
+    """
 
     reference: str | None = None
     side: Literal["left", "right"] = "right"
+    rotation: tuple[Vector, Vector, Vector] | None = None
+    axes: Axes | None = None
+
+    @model_validator(mode="after")
+    def _one_proper_frame(self) -> Self:
+        if self.rotation and self.axes:
+            raise ValueError("rotation and axes exclude each other: the anatomical frame has one definition")
+        if self.rotation:
+            x, y, z = self.rotation
+            # written with a few figures; what is left of the error is removed where the rotation is used
+            products = [sum(p * q for p, q in zip(a, b, strict=True)) for a, b in ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x))]
+            right = (x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0])
+            orthonormal = all(abs(value - wanted) < ORTHONORMAL for value, wanted in zip(products, (1, 1, 1, 0, 0, 0), strict=True))
+            if not orthonormal or sum(p * q for p, q in zip(right, z, strict=True)) < 0:
+                raise ValueError("rotation must have three right-handed axes of length 1, each at right angles to the others, as rows")
+        return self
 
 
 class Study(Frozen):
@@ -61,6 +90,7 @@ class Study(Frozen):
     calibration: dict[int, Path] = {}
     motion: Motion = Motion()
     limits: Limits = Limits()
+    report: dict[str, str] = {}
 
     @model_validator(mode="after")
     def _one_frame(self) -> Self:

@@ -87,7 +87,7 @@ def write_tables(out: Path, rows: Iterable[Rows]) -> dict[str, pl.DataFrame]:
     tables = {name: frame((row for exam in every for row in exam[name]), schema) for name, schema in SCHEMAS.items()}
     for name, table in tables.items():
         write_atomic(out / f"{name}.csv", to_csv(table))
-        write_atomic(out / "results.parquet" / f"{name}.parquet", _parquet(table))
+        write_atomic(out / "results.parquet" / f"{name}.parquet", parquet_bytes(table))
     return tables
 
 
@@ -174,7 +174,8 @@ def _read_json(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def _parquet(table: pl.DataFrame) -> bytes:
+def parquet_bytes(table: pl.DataFrame) -> bytes:
+    """Return a table as Parquet."""
     buffer = io.BytesIO()
     table.write_parquet(buffer)
     return buffer.getvalue()

@@ -71,7 +71,97 @@ def fit_rigid(source_mm: Float, target_mm: Float, weights: Float | None = None) 
         spread = np.linalg.svd(points * np.sqrt(w)[:, None], compute_uv=False)
         if not spread[1] > COLLINEAR * spread[0]:
             raise GeometryError("the points lie in line: the rotation about it is not determined")
-    left, _, right = np.linalg.svd(moved.T @ (w[:, None] * centred))
-    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    rotation, _, _ = best_rotation(moved.T @ (w[:, None] * centred))
     translation = onto - rotation @ middle
     return RigidFit(rotation, translation, target_mm - (source_mm @ rotation.T + translation))
+
+
+def best_rotation(cross: Float) -> tuple[Float, Float, Float]:
+    """Return the proper rotations that maximise ``trace(rotation.T @ cross)``.
+
+    Parameters
+    ----------
+    cross : ndarray of shape (..., 3, 3)
+        Sum of ``target @ source.T`` of the centred points.
+
+    Returns
+    -------
+    rotation : ndarray of shape (..., 3, 3)
+    singular : ndarray of shape (..., 3)
+        Singular values of `cross`, falling.
+    handedness : ndarray of shape (...,)
+        -1 where a mirror image would fit better, else 1.
+    """
+    left, singular, right = np.linalg.svd(cross)
+    handedness = np.where(np.linalg.det(left @ right) < 0, -1.0, 1.0)
+    turned = left.copy()
+    turned[..., :, 2] *= handedness[..., None]
+    return turned @ right, singular, handedness
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidFits:
+    """Rigid motions of k bodies of n points each.
+
+    Attributes
+    ----------
+    rotation : ndarray of shape (k, 3, 3)
+    source_cog_mm, target_cog_mm : ndarray of shape (k, 3)
+        Centres of gravity of the points before and after the motion.
+    centred_mm : ndarray of shape (k, n, 3)
+        The source about its centre of gravity.
+    residual_mm : ndarray of shape (k, n, 3)
+        Target minus moved source.
+    mirror_gain_mm2 : ndarray of shape (k,)
+        By how much the sum of squared residuals would fall for a mirror image; 0 where it would not.
+    """
+
+    rotation: Float
+    source_cog_mm: Float
+    target_cog_mm: Float
+    centred_mm: Float
+    residual_mm: Float
+    mirror_gain_mm2: Float
+
+    @property
+    def turned_mm(self) -> Float:
+        """The centred source after the rotation, shape (k, n, 3)."""
+        result: Float = self.centred_mm @ self.rotation.transpose(0, 2, 1)
+        return result
+
+
+def fit_rigid_many(source_mm: Float, target_mm: Float) -> RigidFits:
+    """Fit many rigid motions at once: each minimises ``sum |target - (M source + d)|^2``.
+
+    Parameters
+    ----------
+    source_mm, target_mm : ndarray of shape (k, n, 3)
+        Finite; whether the points determine a motion is told by :func:`line_spread`.
+
+    Returns
+    -------
+    RigidFits
+    """
+    source_cog, target_cog = source_mm.mean(axis=1), target_mm.mean(axis=1)
+    centred, onto = source_mm - source_cog[:, None], target_mm - target_cog[:, None]
+    rotation, singular, handedness = best_rotation(onto.transpose(0, 2, 1) @ centred)
+    residual = onto - centred @ rotation.transpose(0, 2, 1)
+    return RigidFits(rotation, source_cog, target_cog, centred, residual, np.where(handedness < 0, 4 * singular[:, 2], 0.0))
+
+
+def line_spread(points_mm: Float) -> tuple[Float, Float]:
+    """Return how far points spread along, and about, the line that fits them best.
+
+    Parameters
+    ----------
+    points_mm : ndarray of shape (k, n, 3)
+
+    Returns
+    -------
+    along_mm, about_mm : ndarray of shape (k,)
+        Roots of the sums of squared distances from the centre of gravity along the line, and from the line. The *condition number* of a
+        segment is ``1 / about`` (Soderkvist and Wedin 1993), usually in 1/m.
+    """
+    centred = points_mm - points_mm.mean(axis=1, keepdims=True)
+    singular = np.linalg.svd(centred, compute_uv=False)
+    return singular[:, 0], np.hypot(singular[:, 1], singular[:, 2])
