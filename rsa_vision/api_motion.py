@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from rsa_vision.errors import SettingsError, UsageError
+from rsa_vision.kinematics.series import MarkerTable, make_series
 from rsa_vision.marker_files import MarkerFile, read_markers
 from rsa_vision.motion_tables import (
     group_table,
@@ -20,7 +21,6 @@ from rsa_vision.motion_tables import (
     rigidity_table,
     write_motion_tables,
 )
-from rsa_vision.series import MarkerTable, make_series
 from rsa_vision.settings import Motion, Study, describe_validation, load_study
 from rsa_vision.store import read_run
 from rsa_vision.tables import SCHEMAS

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from rsa_vision.errors import PointsError, UsageError
-from rsa_vision.series import MarkerTable
+from rsa_vision.kinematics.series import MarkerTable
 from rsa_vision.types import Bool, Float
 
 PLACE: Final = ("x_mm", "y_mm", "z_mm")

@@ -10,11 +10,11 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from rsa_vision.growth import compare_lengths
-from rsa_vision.kinema import BESIDE, NUMBERS, Columns, follow_up_pairs, motions, repeat_pairs
-from rsa_vision.precision import summarise
-from rsa_vision.rigidity import rigidity
-from rsa_vision.series import Series
+from rsa_vision.kinematics.growth import compare_lengths
+from rsa_vision.kinematics.kinema import BESIDE, NUMBERS, Columns, follow_up_pairs, motions, repeat_pairs
+from rsa_vision.kinematics.precision import summarise
+from rsa_vision.kinematics.rigidity import rigidity
+from rsa_vision.kinematics.series import Series
 from rsa_vision.settings import Limits, Motion
 from rsa_vision.store import parquet_bytes, to_csv, write_atomic
 from rsa_vision.tables import NUMBER, TEXT, TRUTH, WHOLE, Row, frame

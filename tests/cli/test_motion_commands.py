@@ -195,8 +195,8 @@ def test_growth_between_two_times_has_stated_errors_that_are_true(markers: Path)
 
 
 def test_ten_thousand_motions_take_a_second(tmp_path: Path) -> None:
-    from rsa_vision.kinema import motions
-    from rsa_vision.series import make_series
+    from rsa_vision.kinematics.kinema import motions
+    from rsa_vision.kinematics.series import make_series
     from rsa_vision.settings import Limits, Motion
 
     rng = np.random.default_rng(4)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rsa_vision.kinema import Columns, motions
-from rsa_vision.series import MarkerTable, make_series
+from rsa_vision.kinematics.kinema import Columns, motions
+from rsa_vision.kinematics.series import MarkerTable, make_series
 from rsa_vision.settings import Limits, Motion
 
 SEGMENTS = ("bone", "cup", "stem")

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
-from rsa_vision.kinema import motions
-from rsa_vision.series import make_series
+from rsa_vision.kinematics.kinema import motions
+from rsa_vision.kinematics.series import make_series
 from rsa_vision.settings import Limits, Motion
 
 from .bodies import Subject, analyse, subject, table, vector

@@ -8,7 +8,7 @@ from pytransform3d import rotations as pr
 from pytransform3d import transformations as pt
 from scipy.spatial.transform import Rotation
 
-from rsa_vision.series import MarkerTable
+from rsa_vision.kinematics.series import MarkerTable
 from rsa_vision.settings import Limits
 
 from .bodies import analyse, exam_name, pick, subject, table, vector
@@ -243,8 +243,8 @@ def test_a_loose_marker_is_named_and_left_out_of_the_consistent_markers() -> Non
 
 
 def test_the_status_of_examinations_reaches_their_motions() -> None:
-    from rsa_vision.kinema import motions
-    from rsa_vision.series import make_series
+    from rsa_vision.kinematics.kinema import motions
+    from rsa_vision.kinematics.series import make_series
     from rsa_vision.settings import Motion
 
     markers, _ = two_segments()

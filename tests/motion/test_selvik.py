@@ -7,10 +7,10 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rsa_vision.growth import compare_lengths
-from rsa_vision.kinema import motions
+from rsa_vision.kinematics.growth import compare_lengths
+from rsa_vision.kinematics.kinema import motions
+from rsa_vision.kinematics.series import MarkerTable, make_series
 from rsa_vision.motion_tables import precision_table
-from rsa_vision.series import MarkerTable, make_series
 from rsa_vision.settings import Limits, Motion
 
 EXPANSION = 75e-6  # of Plexiglas, per degree

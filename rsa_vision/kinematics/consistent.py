@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rsa_vision.motion_fits import DISTANCE_SIGMA, distance_changes, loose
-from rsa_vision.series import Segment
+from rsa_vision.kinematics.motion_fits import DISTANCE_SIGMA, distance_changes, loose
+from rsa_vision.kinematics.series import Segment
 from rsa_vision.types import Bool
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from rsa_vision.kinema import follow_up_pairs
-from rsa_vision.motion_fits import DISTANCE_SIGMA, distance_changes
-from rsa_vision.series import Segment, Series
+from rsa_vision.kinematics.kinema import follow_up_pairs
+from rsa_vision.kinematics.motion_fits import DISTANCE_SIGMA, distance_changes
+from rsa_vision.kinematics.series import Segment, Series
 from rsa_vision.types import Float
 
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from rsa_vision.series import Segment, Series
+from rsa_vision.kinematics.series import Segment, Series
 from rsa_vision.settings import Motion
 from rsa_vision.types import Float
 

@@ -10,14 +10,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.consistent import consistent_subsets
-from rsa_vision.frames import frame_matrix, frame_name, in_frame
 from rsa_vision.geometry.euler import euler_from_matrix, euler_jacobian
 from rsa_vision.geometry.motion_errors import absolute_transfer, relative_transfer, total_motion
 from rsa_vision.geometry.screw import find_screws, screw_jacobians
-from rsa_vision.motion_fits import Fits, Pairs, fit_segments
+from rsa_vision.kinematics.consistent import consistent_subsets
+from rsa_vision.kinematics.frames import frame_matrix, frame_name, in_frame
+from rsa_vision.kinematics.motion_fits import Fits, Pairs, fit_segments
+from rsa_vision.kinematics.series import Segment, Series
 from rsa_vision.motion_reasons import BIT, FAILURE_BITS, REVIEW_BITS, joined, status_of
-from rsa_vision.series import Segment, Series
 from rsa_vision.settings import Limits, Motion
 from rsa_vision.types import Bool, Float, Int
 

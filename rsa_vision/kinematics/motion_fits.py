@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from rsa_vision.geometry.motion_errors import fit_errors
 from rsa_vision.geometry.rigid import COLLINEAR, LEAST_POINTS, fit_rigid_many, line_spread
+from rsa_vision.kinematics.series import Segment
 from rsa_vision.motion_reasons import BIT, FAILURE_BITS
-from rsa_vision.series import Segment
 from rsa_vision.settings import Limits
 from rsa_vision.types import Bool, Float, Int
 
