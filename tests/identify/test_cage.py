@@ -14,7 +14,7 @@ from rsa_vision.flags import REASONS
 from rsa_vision.identify.cage import CageIdentification, identify_cage
 from rsa_vision.types import MarkerImages
 
-from .point_films import FilmTruth, expose, random_exposure, random_foci
+from synthetic.point_films import FilmTruth, expose, random_exposure, random_foci
 
 EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "60"))  # of each cage; thousands take minutes
 
