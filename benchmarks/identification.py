@@ -38,6 +38,8 @@ CAGES = ("1A", "1B", "1B-420", "2", "user")
 KINDS = ("right", "other cage", "no cage")
 STRANGE = 0.1  # of the examinations show another cage or none
 HIDDEN = 0.02  # chance of a ball to be seen by one focus only, in a third of the examinations; five times that in another third
+MOST_FALSE = 150  # half of the films have less than an eighth of them
+SLACKS_MM = (0.0, 0.005, 0.01)  # errors of the film that the detector cannot state
 PITCH_MM = 0.1
 TIMED_DETECTIONS = 300
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks" / "identification.md"
@@ -134,7 +136,8 @@ def draw(seed: int, name: str) -> Examination:
     films: list[tuple[int | None, FilmTruth]] = []
     exposures = []
     for told_foci in (None,) if told.film == "shared" else tuple(sorted(told.foci)):
-        exposure = random_exposure(rng, true, foci_mm=foci, pitch_mm=PITCH_MM, **fixed)
+        false, slack = int(MOST_FALSE * rng.random() ** 3), float(rng.choice(SLACKS_MM))
+        exposure = random_exposure(rng, true, foci_mm=foci, pitch_mm=PITCH_MM, false_images=false, slack_mm=slack, **fixed)
         exposed = tuple(sorted(true.foci)) if true.film == "shared" else ((told_foci or 1),)
         film = expose(true, exposed, exposure, rng, objects)
         if kind == "no cage":
@@ -149,7 +152,9 @@ def draw(seed: int, name: str) -> Examination:
 def measure(exam: Examination) -> ExaminationResult:
     """Name and reconstruct an examination as the program does."""
     films = [
-        FilmReading(Path(f"{exam.name}_{exam.seed}_f{focus or ''}"), focus, film.shape, 12, (PITCH_MM, PITCH_MM), "told", "auto", film.images)
+        FilmReading(
+            Path(f"{exam.name}_{exam.seed}_f{focus or ''}"), focus, film.shape, 12, (PITCH_MM, PITCH_MM), "told", "auto", film.images
+        )
         for focus, film in exam.films
     ]
     return name_and_reconstruct(films, exam.study, exam.cage)

@@ -16,7 +16,8 @@ from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.camera import camera_rays
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.cage import CageIdentification, identify_cage
-from rsa_vision.identify.pairs import Pairing, Region, cage_region, pair_rays
+from rsa_vision.identify.crossings import Region, cage_region
+from rsa_vision.identify.pairs import Pairing, pair_rays
 from rsa_vision.images import require_pitch
 from rsa_vision.readings import FilmReading, Readings, candidates, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Study

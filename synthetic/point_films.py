@@ -146,7 +146,11 @@ class _Table:
         self.source: list[Source] = []
 
     def add(self, px: Float, shape: str, angle: float, radius: float, contrast: float, source: Source) -> None:
-        for column, value in zip((self.px, self.shape, self.angle, self.radius, self.contrast, self.source), (px, shape, angle, radius, contrast, source), strict=True):
+        for column, value in zip(
+            (self.px, self.shape, self.angle, self.radius, self.contrast, self.source),
+            (px, shape, angle, radius, contrast, source),
+            strict=True,
+        ):
             column.append(value)  # type: ignore[attr-defined]  # lists of several types
 
 
@@ -207,7 +211,14 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: Rng, objects: Ob
             places[focus, "object", n] = to_px(xyz, f)
             if balls.hidden[n] != focus:
                 grown = ((film_origin - f) @ normal) / ((xyz - f) @ normal) / e.pitch_mm
-                table.add(places[focus, "object", n], "ball", np.nan, balls.radius_mm[n] * grown, balls.contrast[n], ("object", focus, "object", n))
+                table.add(
+                    places[focus, "object", n],
+                    "ball",
+                    np.nan,
+                    balls.radius_mm[n] * grown,
+                    balls.contrast[n],
+                    ("object", focus, "object", n),
+                )
     for at in _clutter(e, (cols, rows), rng):
         kind = str(rng.choice(["ball", "pin", "tee"], p=e.clutter_shapes))
         angle = np.nan if kind == "ball" else rng.uniform(-180, 180)
