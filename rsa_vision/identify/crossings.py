@@ -17,6 +17,8 @@ WINDOWS_MM: Final = (3.0, 10.0)  # in which unrelated crossings are counted
 SLACKS_MM: Final = (0.0, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3)  # systematic error of rays beyond their covariance, tried in turn
 FRACTIONS: Final = (0.03, 0.1, 0.2, 0.4, 0.7, 0.9)  # of rays that have a partner, tried likewise
 SLACK_EVIDENCE: Final = 5.0  # log likelihood by which a slack must be better than none
+WORSE: Final = 0.03  # part of the pairs whose error is WORSE_SIGMA times what is stated: a neighbour or an edge beside an image
+WORSE_SIGMA: Final = 3.0
 
 Region = Callable[[Float], Bool]
 
@@ -127,8 +129,10 @@ class Crossings:
 
     def log_ratio(self) -> Float:
         """Log likelihood ratio of the crossing distance, pair against chance."""
-        gauss = -0.5 * (self.distance_mm / self.sigma_mm) ** 2 - np.log(np.sqrt(2 * np.pi) * self.sigma_mm)
-        result: Float = gauss - self.log_density
+        squared = -0.5 * (self.distance_mm / self.sigma_mm) ** 2
+        usual = np.log(1 - WORSE) + squared
+        worse = np.log(WORSE / WORSE_SIGMA) + squared / WORSE_SIGMA**2
+        result: Float = np.logaddexp(usual, worse) - np.log(np.sqrt(2 * np.pi) * self.sigma_mm) - self.log_density
         return result
 
 

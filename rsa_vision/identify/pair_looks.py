@@ -17,7 +17,7 @@ from rsa_vision.types import Float, Int
 
 LEARNT_FROM: Final = 3.0  # pairs (sum of their probabilities) that teach what pairs look like
 USUAL: Final = np.array([0.05, 0.10])  # sd of the ratio of sizes, and of contrasts: a guess that weighs like USUAL_COUNT pairs
-USUAL_COUNT: Final = 3.0
+USUAL_COUNT: Final = 1.0
 LEAST: Final = np.array([0.01, 0.03])
 KIND: Final = np.array([0.03, 0.05])  # sd of sizes and contrasts within a kind of ball
 WIDE: Final = np.array([0.7, 0.7])  # sd of sizes and contrasts of any images
@@ -69,8 +69,7 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
 
     Notes
     -----
-    Two markers that one focus each does not show agree in size and contrast as often as two markers at random do. Two that both foci show
-    need no place in this ratio: the assignments that give each its own partner speak against theirs.
+    Two images of different markers need no place in this ratio: the assignments that give each its own partner speak against theirs.
     """
     first, second = looks.of_ray[looks.a].copy(), looks.of_ray[looks.b].copy()
     first[:, 0] += looks.grown_a
@@ -92,16 +91,10 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
         spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL**2) / (n + USUAL_COUNT))
         unlike = (UNLIKE[0] + weight[(deviation > FAR * spread).any(axis=1)].sum()) / (UNLIKE[1] + n)
         marker = _log_kernels(mean[e], mean[free], weight, np.hypot(KIND, spread / 2), n)
-        if not (known_a[e] and known_b[e]):
-            like = marker - alone.log_density[looks.a[e] if known_a[e] else looks.b[e]]
-        else:
-            ratio, wider = first[e] - second[e] - middle, spread * np.sqrt(1 + 1 / n)
-            of_pair = float((_log_student(ratio / wider, n + 2) - np.log(wider)).sum())
-            apart = (mean[free][:, None] - mean[free][None])[~np.eye(len(free), dtype=bool)]
-            both = (weight[:, None] * weight[None])[~np.eye(len(free), dtype=bool)]
-            of_two = _log_density(ratio, apart, both, wider, n)
-            two_markers = 2 * np.log(alone.markers) + marker + of_two
-            like = marker + of_pair - np.logaddexp(two_markers, alone.log_density[looks.a[e]] + alone.log_density[looks.b[e]])
+        like = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
+        if known_a[e] and known_b[e]:
+            wider = spread * np.sqrt(1 + 1 / n)
+            like += float((_log_student((first[e] - second[e] - middle) / wider, n) - np.log(wider)).sum())
         result[e] = np.logaddexp(np.log1p(-unlike) + like, np.log(unlike))
     return result
 
@@ -114,14 +107,11 @@ class Alone:
     ----------
     log_density : ndarray of shape (n,)
         Of their looks, at that of every ray.
-    markers : float
-        The part of them that are markers.
     hidden : float
         The part of all markers that one focus does not show.
     """
 
     log_density: Float
-    markers: float
     hidden: float
 
 
@@ -143,7 +133,7 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     known = np.isfinite(looks.of_ray[one]).all(axis=1)
     density = np.zeros(len(looks.of_ray))
     if not known.any() or pairs < 0.5:
-        return Alone(density, 1.0, _hidden(float(single.sum()), pairs))
+        return Alone(density, _hidden(float(single.sum()), pairs))
     sample = looks.of_ray[one[known]]
     middle = _weighted_median(sample, np.ones(len(sample)))
 
@@ -156,15 +146,17 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     marker = np.ones(len(one))
     marker[known] = 1 / (1 + np.exp(np.clip(broad(sample) - alike, -50, 50)))
     hidden = _hidden(float(single @ marker), pairs)
-    weight = single + hidden * paired[one]
+    presumed = hidden * 2 * pairs
+    total = float(single.sum()) + presumed + UNKNOWN
     for ray in np.flatnonzero(np.isfinite(looks.of_ray).all(axis=1)):
-        others = looks.image[one[known]] != looks.image[ray]
-        value, w = looks.of_ray[ray], weight[known][others]
-        total = float(w.sum())
-        near = _log_kernels(value, sample[others], w, KIND, total) + np.log(total) if total > 0 else -np.inf
-        density[ray] = np.logaddexp(near, broad(value) + np.log(UNKNOWN)) - np.log(total + UNKNOWN)
-    markers = float(single @ marker + hidden * 2 * pairs)
-    return Alone(density, markers / (float(weight.sum()) + UNKNOWN), hidden)
+        value, w = looks.of_ray[ray], np.where(looks.image[one[known]] != looks.image[ray], single[known], 0.0)
+        parts = [np.log(UNKNOWN) + broad(value)]
+        if w.sum() > 0:
+            parts.append(np.log(w.sum()) + _log_kernels(value, sample, w, KIND, float(w.sum())))
+        # markers look alike: kernels no wider than they must be, lest two hidden ones pass for a pair by their likeness
+        parts.append(np.log(presumed) + _log_density(value, sample, of_pairs, KIND, 2 * pairs))
+        density[ray] = np.logaddexp.reduce(parts) - np.log(total)
+    return Alone(density, hidden)
 
 
 def _hidden(alone: float, pairs: float) -> float:
@@ -179,7 +171,7 @@ def _log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: fl
 
 
 def _log_density(value: Float, sample: Float, weight: Float, width: Float, n: float) -> float:
-    kernels = (_log_student((value - sample) / width, n + 2) - np.log(width)).sum(axis=1)
+    kernels = (_log_student((value - sample) / width, n) - np.log(width)).sum(axis=1)
     with np.errstate(divide="ignore"):
         return float(np.logaddexp.reduce(kernels + np.log(weight / weight.sum())))
 
@@ -194,7 +186,7 @@ def _weighted_median(values: Float, weight: Float) -> Float:
 
 
 def _log_student(t: Float, freedom: float) -> Float:
-    v = float(freedom)
+    v = max(float(freedom), 2.0)
     scale = gammaln((v + 1) / 2) - gammaln(v / 2) - 0.5 * np.log(v * np.pi)
     result: Float = scale - (v + 1) / 2 * np.log1p(np.square(t) / v)
     return result
