@@ -87,8 +87,8 @@ class FilmTruth:
 
     def visible(self, focus: int, role: str) -> int:
         """Return how many marks of a focus have an image."""
-        names = {tuple(one[1:4]) for source in self.source for one in (source[:4], *source[4:])}
-        return sum(name[:2] == (focus, role) and name in self.place_px for name in names)
+        names = {tuple(one[1:4]) for source in self.source for one in (source[:4], *source[4:]) if one[0] == "mark"}
+        return sum(name[:2] == (focus, role) for name in names)
 
 
 def random_foci(cage: Cage, rng: Rng, away_mm: float) -> dict[int, Float]:

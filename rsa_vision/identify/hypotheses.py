@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rsa_vision.identify.film_model import FILM, GAP_MM, Scene
+from rsa_vision.identify.film_model import FILM, GAP_MM, TILT_SD, Scene
 from rsa_vision.identify.focus_search import NEAR_MM, find_foci
+from rsa_vision.identify.grids import NEAR_MM as GRID_NEAR_MM
 from rsa_vision.identify.grids import find_grids
 from rsa_vision.settings import Limits
 from rsa_vision.types import Float, Int
@@ -19,6 +20,7 @@ LARGEST_GAP_MM: Final = 45.0
 FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than allowed, to say `focus-far` rather than `not found`
 WEIGHED: Final = 10  # hypotheses that are fitted
 MELTED: Final = 0.5  # of the control points of a focus may be hidden, or melted into images of another focus
+TILTED: Final = 2.0  # standard deviations of the tilt that are allowed for
 OVERLAP: Final = 0.5  # of the fiducial marks must lie on others after a move that could be mistaken
 
 _Place = tuple[Float, Float, Float, Int]  # film from plane (A, b), focus, image of every mark
@@ -38,7 +40,12 @@ def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, missing: float,
         controls = scene.xyz_mm[mine & scene.own & ~scene.fiducial]
         key = fiducials.tobytes()
         if key not in grids:
-            grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=len(scene.foci), largest_shift_mm=shift, missing=missing)
+            # a film that is tilted shows a grid as a keystone, which no affine map follows; a map through three marks doubles it for others
+            half = np.ptp(fiducials, axis=0) / 2
+            keystone = 2 * TILTED * TILT_SD * half[0] * half[1] / scene.nominal_mm[k, 2]
+            near = max(GRID_NEAR_MM, float(keystone))
+            count = len(scene.foci)
+            grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=count, largest_shift_mm=shift, missing=missing, near_mm=near)
         options.append(
             [
                 (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))
