@@ -6,7 +6,7 @@ any angle, with `orientation = "any"`), gap, tilt, stretch and scale of the film
 marks and of the control points of each focus missing, up to 150 false detections (balls, pins and tees, scattered or in lines and heaps),
 images that coincide, and 5 to 20 object balls, some hidden from one focus. One film in ten is of another cage, or of none.
 
-`suffice`: two thirds of the marks of every focus have an image, at least four and two. `cage named`: of those, examinations whose cage was
+`marks suffice`: two thirds of the marks of every focus have an image, at least four and two, the fiducial marks not nearly on a line. `cage named`: of those, examinations whose cage was
 found without a rival. `markers paired`: of those, examinations without an ambiguous pair. `silent errors`: examinations that are `ok` and
 hold a mark or a marker with the image of another one, or are of another cage or none. `beyond 6 sd`: examinations that are `ok` and hold a
 marker further from the truth than that.
@@ -60,13 +60,15 @@ class Examination:
 
     @property
     def suffices(self) -> bool:
-        """Whether two thirds of the marks of every focus have an image, at least four and two."""
+        """Whether two thirds of the marks of every focus have an image, at least four and two, the fiducial marks not nearly on a line."""
         for focus, film in self.films:
             for f in sorted(self.cage.foci) if focus is None else (focus,):
                 for role, least in (("fiducial", 4), ("control", 2)):
                     count = len(self.cage.marks_of(f, role))  # type: ignore[arg-type]  # a literal of two
                     if film.visible(f, role) < max(least, count - count // 3):
                         return False
+                if film.in_line(self.cage, f):
+                    return False
         return True
 
 

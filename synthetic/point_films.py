@@ -90,6 +90,18 @@ class FilmTruth:
         names = {tuple(one[1:4]) for source in self.source for one in (source[:4], *source[4:]) if one[0] == "mark"}
         return sum(name[:2] == (focus, role) for name in names)
 
+    def in_line(self, cage: Cage, focus: int) -> bool:
+        """Return whether the fiducial marks that a focus shows are nearly on a line: three times nearer to it than those of the cage."""
+        shown = {one[3] for source in self.source for one in (source[:4], *source[4:]) if one[:3] == ("mark", focus, "fiducial")}
+        marks = np.array([m.xyz for m in cage.marks_of(focus, "fiducial")])
+        seen = np.array([m.xyz for m in cage.marks_of(focus, "fiducial") if m.number in shown])
+        return len(seen) < 3 or bool(_breadth(seen) < _breadth(marks) / 3)
+
+
+def _breadth(points: Float) -> float:
+    """Root mean square distance of points from their best line."""
+    return float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(points)))
+
 
 def random_foci(cage: Cage, rng: Rng, away_mm: float) -> dict[int, Float]:
     """Return the cage's foci, each moved by a distance in any direction."""
