@@ -6,10 +6,10 @@ any angle, with `orientation = "any"`), gap, tilt, stretch and scale of the film
 marks and of the control points of each focus missing, up to 150 false detections (balls, pins and tees, scattered or in lines and heaps),
 images that coincide, and 5 to 20 object balls, some hidden from one focus. One film in ten is of another cage, or of none.
 
-`marks suffice`: two thirds of the marks of every focus have an image, at least four and two, the fiducial marks not nearly on a line. `cage named`: of those, examinations whose cage was
-found without a rival. `markers paired`: of those, examinations without an ambiguous pair. `silent errors`: examinations that are `ok` and
-hold a mark or a marker with the image of another one, or are of another cage or none. `beyond 6 sd`: examinations that are `ok` and hold a
-marker further from the truth than that.
+`marks suffice`: two thirds of the marks of every focus have an image, at least four and two, the fiducial marks not nearly on a line.
+`cage named`: of those, examinations whose cage was found without a rival. `markers paired`: of those, examinations without an ambiguous
+pair. `silent errors`: examinations that are `ok` and hold a mark or a marker with the image of another one. `beyond 6 sd`: examinations
+that are `ok` and hold a marker further from the truth than that. A false detection that looks like a marker is `marker-one-view`: `review`.
 """
 
 from __future__ import annotations

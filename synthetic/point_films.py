@@ -10,7 +10,7 @@ import numpy as np
 
 from rsa_vision.cages import Cage, Mark
 from rsa_vision.flags import MarkerFlag
-from rsa_vision.types import Float, MarkerImages
+from rsa_vision.types import Bool, Float, MarkerImages
 
 Rng = np.random.Generator
 Source = tuple[Any, ...]
@@ -201,9 +201,11 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: Rng, objects: Ob
     def to_px(point: Float, focus: Float) -> Float:
         way = point - focus
         q = focus + way * ((film_origin - focus) @ film_normal) / (way @ film_normal) - film_origin
-        return np.array([cols / 2, rows / 2]) + px_per_mm @ np.array([q @ u, q @ v]) * flip
+        at: Float = np.array([cols / 2, rows / 2]) + px_per_mm @ np.array([q @ u, q @ v]) * flip
+        return at
 
-    table, places = _Table(), {}
+    table = _Table()
+    places: dict[Source, Float] = {}
     for focus in foci:
         f = np.asarray(e.foci_mm.get(focus, np.array(cage.foci[focus], float)))
         own = [m for m in cage.mark if focus in m.foci]
@@ -218,7 +220,7 @@ def expose(cage: Cage, foci: tuple[int, ...], e: Exposure, rng: Rng, objects: Ob
                 places[focus, m.role, m.number] = to_px(xyz, f)
             if (xyz - origin) @ normal < -1 or (xyz - f) @ normal > -50 or (m in own and (m.role, m.number) in hidden):
                 continue
-            _add_mark(table, m, ("mark" if m in own else "foreign", focus, m.role, m.number), lambda p, f=f: to_px(p, f), e, rng)  # type: ignore[misc]
+            _add_mark(table, m, ("mark" if m in own else "foreign", focus, m.role, m.number), lambda p, f=f: to_px(p, f), e, rng)
         for n, xyz in enumerate(balls.xyz_mm):
             places[focus, "object", n] = to_px(xyz, f)
             if balls.hidden[n] != focus:
@@ -279,7 +281,7 @@ def _detected(table: _Table, shape: tuple[int, int], places: Mapping[Source, Flo
     kind, radius = np.array(table.shape, "U4"), np.array(table.radius, float)
     sd = e.noise_px * rng.uniform(0.7, 1.5, n)
     flags = np.zeros(n, np.int64)
-    keep = ((position > -20) & (position < np.array(shape[::-1]) + 20)).all(axis=1)
+    keep: Bool = np.array(((position > -20) & (position < np.array(shape[::-1]) + 20)).all(axis=1))
     for i in range(n):
         if not keep[i]:
             continue
@@ -289,8 +291,8 @@ def _detected(table: _Table, shape: tuple[int, int], places: Mapping[Source, Flo
                 keep[i], position[j], sd[j] = False, (position[i] + position[j]) / 2, max(sd[j], apart[j] / 4)
                 named[j] = (*named[j], named[i])
                 break
-            sd[[i, j]] *= 2
-            flags[[i, j]] = int(MarkerFlag.OVERLAP)
+            sd[[i, int(j)]] *= 2
+            flags[[i, int(j)]] = int(MarkerFlag.OVERLAP)
     noise = rng.normal(size=(2, n, 2))
     position = position + noise[0] * sd[:, None] + noise[1] * e.slack_mm / e.pitch_mm
     contrast = np.array(table.contrast, float) * np.exp(rng.normal(0, 0.03, n))

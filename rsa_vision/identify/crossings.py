@@ -153,7 +153,7 @@ def find_crossings(bundle: RayBundle, region: Region | None) -> tuple[Crossings,
     neighbours : tuple of Neighbours
         For every two foci.
     """
-    known = np.isfinite(bundle.through_mm).all(axis=1) & np.isfinite(bundle.covariance_mm2).all(axis=(1, 2))
+    known: Bool = np.array(np.isfinite(bundle.through_mm).all(axis=1) & np.isfinite(bundle.covariance_mm2).all(axis=(1, 2)))
     inside = region or in_front(bundle.rows(known))
     length = np.linalg.norm(bundle.through_mm - bundle.origin_mm, axis=1)
     none = np.zeros(0)

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from scipy.special import gammaln
 
-from rsa_vision.types import Float, Int
+from rsa_vision.types import Bool, Float, Int
 
 LEARNT_FROM: Final = 3.0  # pairs (sum of their probabilities) that teach what pairs look like
 USUAL: Final = np.array([0.05, 0.10])  # sd of the ratio of sizes, and of contrasts: a guess that weighs like USUAL_COUNT pairs
@@ -74,7 +74,8 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
     first, second = looks.of_ray[looks.a].copy(), looks.of_ray[looks.b].copy()
     first[:, 0] += looks.grown_a
     second[:, 0] += looks.grown_b
-    known_a, known_b = np.isfinite(first).all(axis=1), np.isfinite(second).all(axis=1)
+    known_a: Bool = np.array(np.isfinite(first).all(axis=1))
+    known_b: Bool = np.array(np.isfinite(second).all(axis=1))
     mean = np.where((known_a & known_b)[:, None], (first + second) / 2, np.where(known_a[:, None], first, second))
     teachers = np.flatnonzero(known_a & known_b & (pair > FAINT))
     result = np.zeros(len(pair))
