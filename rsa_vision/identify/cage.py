@@ -192,7 +192,7 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
         complete = any((naming.image[scene.own] >= 0).mean() > COMPLETE for naming in namings)
         if namings and not complete:
             best = max(namings, key=lambda n: n.log_evidence)
-            _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters))
+            _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters, limits))
         enough = any((naming.image[scene.own] >= 0).mean() > HALF for naming in namings)
         if enough or not misread or among.all():
             result = _decide(answer, scene, namings, seen, limits, log_room)
@@ -209,7 +209,7 @@ def _weigh(namings: list[Naming], scene: Scene, seen: FilmImages, log_room: floa
         places = project(scene, start)
         if not any(np.abs(places - project(scene, naming.fit.parameters)).max() < SAME_MM for naming in namings):
             naming = name_marks(scene, start, seen, log_room, least=least)
-            if naming:
+            if naming and not any(np.array_equal(naming.image, other.image) for other in namings):
                 namings.append(naming)
 
 

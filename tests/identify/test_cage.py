@@ -323,3 +323,18 @@ def test_nan_among_good_images_and_covariances_are_borne() -> None:
     assert result
     assert not set(bad) & {i for marks in result.assignments.values() for i in marks.values()}
     assert set(result.reasons) <= set(REASONS)
+
+
+def test_hidden_end_columns_with_other_foci_are_ambiguous() -> None:
+    """Columns of cage 1B-420 are 50 and 45 mm apart: with an end column hidden, all names moved by one agree with foci 17 mm away."""
+    cage = load_cage("1B-420")
+    hidden = {1: {("fiducial", 1), ("fiducial", 6), ("control", 11), ("control", 18)}}
+    hidden[2] = {("fiducial", 1), ("fiducial", 6), ("control", 14), ("control", 21)}
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        exposure = random_exposure(rng, cage, missing=0, false_images=10, turn_deg=5.0, slack_mm=0.0, foci_mm=random_foci(cage, rng, 60.0))
+        film = expose(cage, (1, 2), exposure, rng)
+        kept = np.array([source[0] != "mark" or source[2:4] not in hidden[source[1]] for source in film.source])
+        result = identify(replace(film, images=film.images.rows(kept)), cage, (1, 2))
+        assert "cage-ambiguous" in result.reasons, f"seed {seed}"
+        assert result.runner_up
