@@ -43,9 +43,14 @@ def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, missing: float,
             # a film that is tilted shows a grid as a keystone, which no affine map follows; a map through three marks doubles it for others
             half = np.ptp(fiducials, axis=0) / 2
             keystone = 2 * TILTED * TILT_SD * half[0] * half[1] / scene.nominal_mm[k, 2]
-            near = max(GRID_NEAR_MM, float(keystone))
             count = len(scene.foci)
-            grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=count, largest_shift_mm=shift, missing=missing, near_mm=near)
+            grids[key] = [
+                grid
+                for near in sorted({GRID_NEAR_MM, max(GRID_NEAR_MM, float(keystone))})
+                for grid in find_grids(
+                    xy_mm, fiducials, turn_deg=turn_deg, foci=count, largest_shift_mm=shift, missing=missing, near_mm=near
+                )
+            ]
         options.append(
             [
                 (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))

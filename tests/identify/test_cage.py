@@ -243,16 +243,19 @@ def test_smallest_cage_is_named_or_doubted_but_never_wrong() -> None:
 
 
 def test_two_of_three_control_points_are_enough_wherever_they_stand() -> None:
-    cage = small_cage(3)
+    few = small_cage(3)
+    more = [(10.0, 20.0), (-20.0, 110.0), (40.0, 120.0), (5.0, 190.0)]
+    added = [Mark(number=21 + i, role="fiducial", foci=(1,), shape="ball", xyz=(x, y, 0.0), diameter=0.8) for i, (x, y) in enumerate(more)]
+    cage = few.model_copy(update={"mark": (*few.mark, *added)})
     for lost in (11, 12, 13):
         rng = np.random.default_rng(lost)
         film = expose(cage, (1,), random_exposure(rng, cage, missing=0, false_images=10, noise_px=0.03, turn_deg=5.0), rng)
         rows = np.array([source[2:4] != ("control", lost) for source in film.source])
         images, sources = film.images.rows(rows), [s for s, keep in zip(film.source, rows, strict=True) if keep]
         result = identify_cage(images, cage, (1,), pitch_mm=(0.1, 0.1), film_shape=film.shape)
-        assert {"few-fiducials", "few-controls"} <= set(result.reasons)
+        assert "few-controls" in result.reasons
         assert replace(film, images=images, source=sources).errors(result.assignments) == []
-        assert len(result.assignments[1]) == 6
+        assert sum(role == "control" for role, _ in result.assignments[1]) == 2
 
 
 @pytest.mark.parametrize("tilt", [(0.03, 0.0), (0.0, 0.03), (-0.025, 0.025)])
