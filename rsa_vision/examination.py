@@ -16,7 +16,8 @@ from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.camera import camera_rays
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.cage import CageIdentification, identify_cage
-from rsa_vision.identify.pairs import Pairing, Region, cage_region, pair_rays
+from rsa_vision.identify.crossings import Region, cage_region
+from rsa_vision.identify.pairs import Pairing, pair_rays
 from rsa_vision.images import require_pitch
 from rsa_vision.readings import FilmReading, Readings, candidates, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Study
@@ -90,18 +91,42 @@ def measure_examination(
         every = [*cage_films, *films]
         pitches = [require_pitch(film, study.pixel_pitch_mm) if isinstance(geometry, Cage) else None for film, _ in every]
         table = Readings.of([_read(*exposed, pitch, study) for exposed, pitch in zip(every, pitches, strict=True)])
-        seconds["detect"] = perf_counter() - started
-        if blank := [film.path.name for film in table.films if not len(film.images)]:
-            return _failed(table, [("no-markers", f"{name}: no marker image was found") for name in blank], seconds)
-        started = perf_counter()
-        if isinstance(geometry, Cage):
-            result = _with_cage(table, len(cage_films), study, geometry)
-        else:
-            result = _with_cameras(table, study, geometry)
-        seconds["name and reconstruct"] = perf_counter() - started
-        return replace(result, seconds=seconds)
     except RsaError as error:
         return _failed(table, [(error.code, str(error))], seconds)
+    seconds["detect"] = perf_counter() - started
+    started = perf_counter()
+    result = name_and_reconstruct(table.films, study, geometry, n_cage_films=len(cage_films))
+    seconds["name and reconstruct"] = perf_counter() - started
+    return replace(result, seconds=seconds)
+
+
+def name_and_reconstruct(
+    films: Sequence[FilmReading], study: Study, geometry: Cage | Mapping[int, Camera], *, n_cage_films: int = 0
+) -> ExaminationResult:
+    """Measure one examination whose marker images were found already.
+
+    Parameters
+    ----------
+    films : sequence of FilmReading
+        Films of the cage alone first, if there are any.
+    study : Study
+    geometry : Cage, or mapping of focus number to Camera
+    n_cage_films : int
+
+    Returns
+    -------
+    ExaminationResult
+        Without times; expected failures are verdicts.
+    """
+    table = Readings.of(films)
+    if blank := [film.path.name for film in table.films if not len(film.images)]:
+        return _failed(table, [("no-markers", f"{name}: no marker image was found") for name in blank])
+    try:
+        if isinstance(geometry, Cage):
+            return _with_cage(table, n_cage_films, study, geometry)
+        return _with_cameras(table, study, geometry)
+    except RsaError as error:
+        return _failed(table, [(error.code, str(error))])
 
 
 def reconstruct_points(points: ImagePoints, study: Study, cage: Cage) -> ExaminationResult:

@@ -27,6 +27,8 @@ COMPLETE: Final = 0.85  # of the marks named: no grid moved by a row or column c
 MISSING: Final = 1 / 3  # of the marks of a focus may have no image
 MISREAD: Final = 0.45  # or none of the mark's shape
 SAME_MM: Final = 1.5  # hypotheses that show every mark as near as this come to the same naming
+HALF: Final = 0.6  # of the marks of the best naming: each is worth several units of log evidence, fewer can be no rival
+ONTO_ITSELF: Final = 4  # rotations that may turn a grid onto itself
 CLOSE: Final = 80.0  # of the best in log evidence: gross errors of others could not make them win
 LEAST_IMAGES: Final = 6  # four fiducial marks and two control points
 LOG_FALSE: Final = 16.0  # evidence against clutter that is demanded: one false cage in 1e7 films
@@ -190,21 +192,24 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
         complete = any((naming.image[scene.own] >= 0).mean() > COMPLETE for naming in namings)
         if namings and not complete:
             best = max(namings, key=lambda n: n.log_evidence)
-            _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters))
-        if complete or not misread or among.all():
+            _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters, limits))
+        enough = any((naming.image[scene.own] >= 0).mean() > HALF for naming in namings)
+        if enough or not misread or among.all():
             result = _decide(answer, scene, namings, seen, limits, log_room)
-        if complete or (result and not misread) or among.all():
+        sure = enough and result and "cage-ambiguous" not in result.reasons  # what the other images hide of it was weighed, too
+        if complete or sure or (result and not misread) or among.all():
             break
     return result
 
 
 def _weigh(namings: list[Naming], scene: Scene, seen: FilmImages, log_room: float, starts: list[Float]) -> None:
-    """Name the marks for every hypothesis that is not one of the namings already."""
+    """Name the marks for every hypothesis that is not one of the namings already, nor explains far less than they do."""
     for start in starts:
+        least = int(HALF * max(((naming.image[scene.own] >= 0).sum() for naming in namings), default=0))
         places = project(scene, start)
         if not any(np.abs(places - project(scene, naming.fit.parameters)).max() < SAME_MM for naming in namings):
-            naming = name_marks(scene, start, seen, log_room)
-            if naming:
+            naming = name_marks(scene, start, seen, log_room, least=least)
+            if naming and not any(np.array_equal(naming.image, other.image) for other in namings):
                 namings.append(naming)
 
 
@@ -215,8 +220,8 @@ def _doubt_what_was_told(film: _Film, told: _Reading, result: CageIdentification
     named = np.isin(film.usable(), [*result.assignments[told.foci[0]].values()])
     for other in _other_readings(film.cage, told):
         scene, seen, log_room = build_scene(film.cage, other.foci, film.foci_mm), film.seen(other), film.log_room(other)
-        for start in find_hypotheses(scene, seen.xy_mm[named], other.turn_deg, MISSING, limits):
-            naming = name_marks(scene, start, seen, log_room)
+        for start in find_hypotheses(scene, seen.xy_mm[named], other.turn_deg, MISSING, limits)[:ONTO_ITSELF]:
+            naming = name_marks(scene, start, seen, log_room, least=int(HALF * named.sum()))
             if naming and naming.log_evidence - far_penalty(scene, naming, limits) > result.log_evidence + LOG_MISLED:
                 reasons = tuple(dict.fromkeys(("cage-ambiguous", *result.reasons)))
                 return replace(result, posterior=0.0, reasons=reasons, runner_up=f"the cage's other marks tell that this is {other}")

@@ -41,8 +41,9 @@ def what_is_missing(scene: Scene, naming: Naming) -> str:
             seen = int((naming.image[wanted] >= 0).sum())
             if seen < max(least, np.ceil(FOUND * wanted.sum())):
                 return f"only {seen} of {wanted.sum()} {name} of focus {focus}"
-            if _breadth(scene.xyz_mm[wanted & (naming.image >= 0)]) < SPREAD * _breadth(scene.xyz_mm[wanted]):
-                return f"the {name} found of focus {focus} lie nearly in line"
+            breadth, word = (_breadth, "in line") if fiducial else (_extent, "in one place")  # two points fix a focus, no line a plane
+            if breadth(scene.xyz_mm[wanted & (naming.image >= 0)]) < SPREAD * breadth(scene.xyz_mm[wanted]):
+                return f"the {name} found of focus {focus} lie nearly {word}"
     return ""
 
 
@@ -50,6 +51,11 @@ def _breadth(points: Float) -> float:
     """Return the root mean square distance of points from their best line."""
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(np.linalg.norm(singular[1:]) / np.sqrt(len(points)))
+
+
+def _extent(points: Float) -> float:
+    """Return the root mean square distance of points from their middle."""
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def impossible_stretch(naming: Naming) -> str:

@@ -17,6 +17,7 @@ from rsa_vision.types import Float
 NEAR_MM: Final = 1.2  # images in the plane: the grid is known to some tenths of a millimetre, the focus by two points only
 LARGEST: Final = 4  # places that are returned
 MOST_LINES: Final = 400
+FEW: Final = 4
 
 
 def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm: float, missing: float) -> list[tuple[Float, int]]:
@@ -52,7 +53,8 @@ def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm:
         mark, image = mark[nearest], image[nearest]
     spread = np.linalg.norm(controls_mm[:, None] - controls_mm[None], axis=-1)
     first, second = np.triu_indices(len(mark), 1)
-    wide = (spread[mark[first], mark[second]] > 0.35 * spread.max()) & (image[first] != image[second])
+    apart = 0.35 * spread.max() if len(controls_mm) > FEW else 0.0  # of a few any two may be all that is left
+    wide = (spread[mark[first], mark[second]] > apart) & (image[first] != image[second])
     first, second = first[wide], second[wide]
     near_a, near_b, *_ = closest_approach(
         through[image[first]], controls_mm[mark[first]], through[image[second]], controls_mm[mark[second]]

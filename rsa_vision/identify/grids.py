@@ -86,7 +86,14 @@ class _Raster:
 
 
 def find_grids(
-    images_mm: Float, fiducials_mm: Float, *, turn_deg: float, foci: int, largest_shift_mm: float, missing: float
+    images_mm: Float,
+    fiducials_mm: Float,
+    *,
+    turn_deg: float,
+    foci: int,
+    largest_shift_mm: float,
+    missing: float,
+    near_mm: float = NEAR_MM,
 ) -> list[tuple[Float, Float, int]]:
     """Find all places of a grid of fiducial marks among the images of a film.
 
@@ -104,6 +111,8 @@ def find_grids(
         Between two of them.
     missing : float
         Largest fraction of the marks without an image.
+    near_mm : float
+        How far from its image an affine map may put a mark.
 
     Returns
     -------
@@ -115,27 +124,27 @@ def find_grids(
     if n < least or n < 4:
         return []
     tree = cKDTree(images_mm)
-    maps = _hypotheses(images_mm, tree, fiducials_mm, turn_deg, least)
-    anchors = _distinct(maps, fiducials_mm, 1.5 * NEAR_MM)[:LARGEST]
+    maps = _hypotheses(images_mm, tree, fiducials_mm, turn_deg, least, near_mm)
+    anchors = _distinct(maps, fiducials_mm, 1.5 * near_mm)[:LARGEST]
     found: list[tuple[Float, int]] = []
     for affine, _ in anchors:
-        refined = _refine(affine, images_mm, tree, fiducials_mm, least)
+        refined = _refine(affine, images_mm, tree, fiducials_mm, least, near_mm)
         if refined is None or not _plausible(refined[0][None], turn_deg)[0]:
             continue
         if foci == 1:
             found.append(refined)
         else:
-            found += _shifts(refined[0], images_mm, tree, fiducials_mm, max(4, least - FEWER), largest_shift_mm)
+            found += _shifts(refined[0], images_mm, tree, fiducials_mm, max(4, least - FEWER), largest_shift_mm, near_mm)
     grids = _distinct(found, fiducials_mm, SAME_MM)[:LARGEST]
     return [(affine[:2].T, affine[2], count) for affine, count in grids]
 
 
-def _hypotheses(images: Float, tree: cKDTree, marks: Float, turn_deg: float, least: int) -> list[tuple[Float, int]]:
+def _hypotheses(images: Float, tree: cKDTree, marks: Float, turn_deg: float, least: int, near_mm: float) -> list[tuple[Float, int]]:
     """Return affine maps, shape (3, 2) for rows (u, v, 1), by all triples of images that fit a triple of marks."""
     difference = images[None] - images[:, None]
     length = np.hypot(difference[..., 0], difference[..., 1])
     direction = np.arctan2(difference[..., 1], difference[..., 0])
-    raster = _Raster(images, NEAR_MM)
+    raster = _Raster(images, near_mm)
     homogeneous = np.column_stack([marks, np.ones(len(marks))])
     found: list[tuple[Float, int]] = []
     for a, b, c in _triples(tuple(map(tuple, marks.tolist())), least):
@@ -153,7 +162,7 @@ def _hypotheses(images: Float, tree: cKDTree, marks: Float, turn_deg: float, lea
         z = complex(*(marks[c] - marks[a])) / complex(*side)
         span = difference[first, second]
         third = images[first] + np.column_stack([z.real * span[:, 0] - z.imag * span[:, 1], z.imag * span[:, 0] + z.real * span[:, 1]])
-        reach = 2.2 * SHEAR * float(max(np.hypot(*(marks[c] - marks[a])), np.hypot(*(marks[c] - marks[b])))) + NEAR_MM
+        reach = 2.2 * SHEAR * float(max(np.hypot(*(marks[c] - marks[a])), np.hypot(*(marks[c] - marks[b])))) + near_mm
         near = min(4, len(images))
         distance, index = (np.asarray(part) for part in tree.query(third, k=near, distance_upper_bound=reach))
         pair, which = np.nonzero(np.isfinite(distance.reshape(-1, near)))
@@ -196,9 +205,9 @@ def _distinct(maps: list[tuple[Float, int]], marks: Float, tolerance: float) -> 
     return kept
 
 
-def _refine(affine: Float, images: Float, tree: cKDTree, marks: Float, least: int) -> tuple[Float, int] | None:
+def _refine(affine: Float, images: Float, tree: cKDTree, marks: Float, least: int, near_mm: float) -> tuple[Float, int] | None:
     homogeneous = np.column_stack([marks, np.ones(len(marks))])
-    for reach in (1.5 * NEAR_MM, NEAR_MM):
+    for reach in (1.5 * near_mm, near_mm):
         distance, index = (np.asarray(part) for part in tree.query(homogeneous @ affine, distance_upper_bound=reach))
         near = np.isfinite(distance)
         if near.sum() < least or len(np.unique(index[near])) < least:
@@ -209,15 +218,17 @@ def _refine(affine: Float, images: Float, tree: cKDTree, marks: Float, least: in
     return affine, int(near.sum())
 
 
-def _shifts(affine: Float, images: Float, tree: cKDTree, marks: Float, least: int, largest: float) -> list[tuple[Float, int]]:
+def _shifts(
+    affine: Float, images: Float, tree: cKDTree, marks: Float, least: int, largest: float, near_mm: float
+) -> list[tuple[Float, int]]:
     """Find by voting the shifts of a grid that again put enough marks onto images, no shift included."""
     places = np.column_stack([marks, np.ones(len(marks))]) @ affine
-    neighbours = [tree.query_ball_point(place, largest + NEAR_MM) for place in places]
+    neighbours = [tree.query_ball_point(place, largest + near_mm) for place in places]
     owner = np.repeat(np.arange(len(marks)), [len(some) for some in neighbours])
     shifts = images[np.concatenate([np.array(some, int) for some in neighbours])] - places[owner]
     apart = np.abs(shifts[:, None] - shifts[None]).max(axis=2)
     starts = np.flatnonzero(np.diff(owner, prepend=-1))  # one mark may have many images near a shift, and counts once
-    nearest = np.minimum.reduceat(apart, starts, axis=1) < NEAR_MM
+    nearest = np.minimum.reduceat(apart, starts, axis=1) < near_mm
     votes = nearest.sum(axis=1)
     found: list[tuple[Float, int]] = []
     for index in np.argsort(-votes, kind="stable"):
@@ -228,7 +239,7 @@ def _shifts(affine: Float, images: Float, tree: cKDTree, marks: Float, least: in
         agreeing = [
             first + int(np.argmin(apart[index, first:last])) for first, last in zip(starts, [*starts[1:], len(shifts)], strict=True)
         ]
-        shift = np.median(shifts[[i for i in agreeing if apart[index, i] < NEAR_MM]], axis=0)
+        shift = np.median(shifts[[i for i in agreeing if apart[index, i] < near_mm]], axis=0)
         if all(np.abs(affine[2] + shift - other[2]).max() > SHIFT_MM for other, _ in found):
             moved = affine.copy()
             moved[2] += shift

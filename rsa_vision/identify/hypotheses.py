@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rsa_vision.identify.film_model import FILM, GAP_MM, Scene
+from rsa_vision.identify.film_model import FILM, GAP_MM, TILT_SD, Scene
 from rsa_vision.identify.focus_search import NEAR_MM, find_foci
+from rsa_vision.identify.grids import NEAR_MM as GRID_NEAR_MM
 from rsa_vision.identify.grids import find_grids
 from rsa_vision.settings import Limits
 from rsa_vision.types import Float, Int
@@ -19,7 +20,8 @@ LARGEST_GAP_MM: Final = 45.0
 FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than allowed, to say `focus-far` rather than `not found`
 WEIGHED: Final = 10  # hypotheses that are fitted
 MELTED: Final = 0.5  # of the control points of a focus may be hidden, or melted into images of another focus
-OVERLAP: Final = 0.5  # of the fiducial marks must lie on others after a move that could be mistaken
+TILTED: Final = 2.0  # standard deviations of the tilt that are allowed for
+OVERLAP: Final = 0.5  # of the marks must lie on others after a move that could be mistaken
 
 _Place = tuple[Float, Float, Float, Int]  # film from plane (A, b), focus, image of every mark
 
@@ -38,7 +40,17 @@ def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, missing: float,
         controls = scene.xyz_mm[mine & scene.own & ~scene.fiducial]
         key = fiducials.tobytes()
         if key not in grids:
-            grids[key] = find_grids(xy_mm, fiducials, turn_deg=turn_deg, foci=len(scene.foci), largest_shift_mm=shift, missing=missing)
+            # a film that is tilted shows a grid as a keystone, which no affine map follows; a map through three marks doubles it for others
+            half = np.ptp(fiducials, axis=0) / 2
+            keystone = 2 * TILTED * TILT_SD * half[0] * half[1] / scene.nominal_mm[k, 2]
+            count = len(scene.foci)
+            grids[key] = [
+                grid
+                for near in sorted({GRID_NEAR_MM, max(GRID_NEAR_MM, float(keystone))})
+                for grid in find_grids(
+                    xy_mm, fiducials, turn_deg=turn_deg, foci=count, largest_shift_mm=shift, missing=missing, near_mm=near
+                )
+            ]
         options.append(
             [
                 (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))
@@ -98,21 +110,38 @@ def _start(scene: Scene, choice: Sequence[_Place]) -> Float | None:
     return np.concatenate([(A / stretch).ravel(), b, [gap, 0, 0], foci.ravel()])
 
 
-def moved_by_a_mark(scene: Scene, parameters: Float) -> list[Float]:
-    """Return the hypotheses that take the fiducial grid for the same grid moved by a row or column, cage and foci as a whole.
+def moved_by_a_mark(scene: Scene, parameters: Float, limits: Limits) -> list[Float]:
+    """Return the hypotheses that take the grids of marks for the same grids moved by a row or column.
 
-    A cage with rows and columns hidden looks like itself, moved, with others hidden: what is found must be weighed against that.
+    A cage with rows and columns hidden looks like itself, moved, with others hidden: what is found must be weighed against that. Where
+    fiducial marks move by m and control points of the height z by n, every line through an image and its control point still passes
+    through one point: a focus of the height h moves by m + (n - m) h / z. If the pitches of both grids are nearly alike, that is not far.
     """
-    mine = scene.fiducial & (scene.focus == 0)
-    points = scene.xyz_mm[mine, :2]
-    moves = (points[None] - points[:, None]).reshape(-1, 2)
-    moves = np.unique(np.round(moves[np.abs(moves).max(axis=1) > 1], 3), axis=0)
+    found = []
+    reach = FOCUS_REACH * limits.focus_mm
+    foci = parameters[FILM:].reshape(-1, 3)
+    for move in [np.zeros(3), *_moves(scene.xyz_mm[scene.fiducial & (scene.focus == 0)])]:
+        places: list[list[Float]] = []
+        for k, focus in enumerate(foci):
+            controls = scene.xyz_mm[scene.own & ~scene.fiducial & (scene.focus == k)]
+            options = [focus + move + (other - move) * focus[2] / controls[:, 2].mean() for other in _moves(controls)]
+            options += [focus + move]
+            places.append([place for place in options if np.linalg.norm(place - scene.nominal_mm[k]) < reach])
+        for choice in product(*places):
+            start = parameters.copy()
+            start[4:6] -= parameters[:4].reshape(2, 2) @ move[:2]
+            start[FILM:] = np.concatenate(choice)
+            found.append(start)
+    return found
+
+
+def _moves(marks: Float) -> list[Float]:
+    """Return the shifts, level with the plane, that put more than half of the marks onto others."""
+    moves = (marks[None] - marks[:, None]).reshape(-1, 3)
+    moves = np.unique(np.round(moves[(np.abs(moves[:, :2]).max(axis=1) > 1) & (np.abs(moves[:, 2]) < 1)], 3), axis=0)
     found = []
     for move in moves:
-        landed = np.hypot(*(points[:, None] + move - points[None]).transpose(2, 0, 1)).min(axis=1) < 2.0
+        landed = np.linalg.norm(marks[:, None] + move - marks[None], axis=2).min(axis=1) < 2.0
         if landed.mean() > OVERLAP:
-            start = parameters.copy()
-            start[4:6] -= parameters[:4].reshape(2, 2) @ move
-            start[FILM:] += np.tile([*move, 0.0], len(scene.foci))
-            found.append(start)
+            found.append(np.array([move[0], move[1], 0.0]))
     return found

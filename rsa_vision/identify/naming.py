@@ -27,6 +27,7 @@ SETTLED_MM: Final = 0.02
 SETTLING: Final = 8  # rounds of naming and fitting at most, until the names stay
 NEAR_MM: Final = 1.0  # images further apart than this are never one
 LEAST_GAP_MM: Final = -0.1  # the film lies behind the plane: with the foci exchanged it would lie before
+LEAST: Final = 6  # named marks: four fiducial marks and two control points
 GATE: Final = 16.0  # squared distance in sigma
 
 
@@ -133,7 +134,9 @@ def melted_images(scene: Scene, naming: Naming, images: FilmImages) -> Int:
     return np.unique(np.array(found, dtype=np.int64))
 
 
-def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float, *, banned: Int | None = None) -> Naming | None:
+def name_marks(
+    scene: Scene, start: Float, images: FilmImages, log_room: float, *, banned: Int | None = None, least: int = LEAST
+) -> Naming | None:
     """Name the images under one hypothesis.
 
     Parameters
@@ -146,11 +149,13 @@ def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float, 
         Logarithm of the area and the range of rotations (mm2 rad) in which the film may lie.
     banned : ndarray of int, optional
         Images that are not to be named.
+    least : int
+        Give up where fewer marks have images: an explanation of less is not asked for.
 
     Returns
     -------
     Naming or None
-        None where fewer than six marks have images, or the fit fails.
+        None where too few marks have images, or the fit fails.
     """
     parameters = start
     image = np.full(len(scene.mark), -1)
@@ -167,7 +172,8 @@ def name_marks(scene: Scene, start: Float, images: FilmImages, log_room: float, 
             gain = _no_parts(scene, parameters, images, gain, named)
             named = _assign(gain)
         named = _share(scene, parameters, images, gain, named, slack)
-        if (named[scene.own] >= 0).sum() < 6:
+        count = (named[scene.own] >= 0).sum()
+        if count < LEAST or (count < least and stage != STAGES_MM[0]):
             return None
         settled = stage is None and fitted is not None and np.array_equal(named, image)
         image = named

@@ -127,6 +127,31 @@ def test_wrong_pairs_are_doubted(shared: bool, fixed: dict, named: float, capsys
         assert count["wrong"] == 0
 
 
+@pytest.mark.parametrize("count", [8, 13])
+def test_marker_images_among_clutter_of_other_looks_are_decided(count: int) -> None:
+    sure = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        rays = rays_to(some_markers(count, rng), rng, sd_mm=0.01, false=15)
+        pairing = rays.pair()
+        sure += not pairing.reasons
+        assert all(rays.right(g) or doubted for g, doubted in zip(pairing.groups, pairing.ambiguous, strict=True)), f"seed {seed}"
+    assert sure >= 10
+
+
+def test_hidden_markers_of_one_kind_are_not_sure_by_their_likeness_alone() -> None:
+    """Every marker hidden from one focus or the other: what crosses does so by chance, however alike it looks."""
+    sure = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        markers = some_markers(24, rng)
+        rays = rays_to(markers, rng, shared=False, sd_mm=0.01)
+        keep = np.array([(focus == 1) == (marker % 2 == 0) for focus, marker in rays.marker])[rays.bundle.image]
+        some = Rays(rays.bundle.rows(np.flatnonzero(keep)), rays.radius_mm[keep], rays.contrast[keep], rays.marker, False)
+        sure += int((~some.pair().ambiguous).sum())
+    assert sure == 0
+
+
 def epipolar_twins(apart_mm: float, rng: np.random.Generator, **fixed: object) -> Rays:
     """Nine markers, two of which lie in one plane with both foci: their rays cross either way."""
     markers = some_markers(9, rng)

@@ -1,0 +1,193 @@
+"""What two images of one marker look like, against images without a partner; both are learnt from the films at hand.
+
+The images of a marker have the size and contrast of the other markers, and agree with each other, better still, in the size that their
+depth implies and in contrast. Images without a partner look like anything: clutter, or now and then a marker that the other focus does not
+show. Logarithms of size and contrast are used throughout, so that a shift is a factor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.special import gammaln
+
+from rsa_vision.types import Bool, Float, Int
+
+LEARNT_FROM: Final = 3.0  # pairs (sum of their probabilities) that teach what pairs look like
+USUAL: Final = np.array([0.05, 0.10])  # sd of the ratio of sizes, and of contrasts: a guess that weighs like USUAL_COUNT pairs
+USUAL_COUNT: Final = 1.0
+LEAST: Final = np.array([0.01, 0.03])
+KIND: Final = np.array([0.03, 0.05])  # sd of sizes and contrasts within a kind of ball
+WIDE: Final = np.array([0.7, 0.7])  # sd of sizes and contrasts of any images
+HIDDEN: Final = (0.5, 10.0)  # markers that one focus does not show, of all: a guess of one in twenty, which weighs like ten markers
+UNKNOWN: Final = 2.0  # images that look like anything, which are presumed beside those at hand
+UNLIKE: Final = (0.1, 2.0)  # pairs that do not look like one, of all: a guess of one in twenty
+FAR: Final = 4.0  # spreads from which a pair does not look like one
+FAINT: Final = 1e-3  # pairs less probable than that teach nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """What is known of the looks of rays and of their crossings.
+
+    Attributes
+    ----------
+    image : ndarray of int, shape (n,)
+        Image of every ray.
+    of_ray : ndarray of shape (n, 2)
+        Log of apparent radius and of contrast; NaN where unknown.
+    a, b : ndarray of int, shape (m,)
+        The rays of every crossing.
+    grown_a, grown_b : ndarray of shape (m,)
+        Log of the factor by which a marker at the crossing is smaller than its images.
+    """
+
+    image: Int
+    of_ray: Float
+    a: Int
+    b: Int
+    grown_a: Float
+    grown_b: Float
+
+
+def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
+    """Return the log likelihood ratio of what the images of crossings look like: one marker, against two images without partners.
+
+    Parameters
+    ----------
+    looks : Looks
+    pair : ndarray of shape (m,)
+        Probability of every crossing to be a marker, so far.
+    alone : Alone
+
+    Returns
+    -------
+    ndarray of shape (m,)
+        0 where neither look is known or too few pairs have taught. No crossing is judged by what its own rays have taught.
+
+    Notes
+    -----
+    Two images of different markers need no place in this ratio: the assignments that give each its own partner speak against theirs.
+    """
+    first, second = looks.of_ray[looks.a].copy(), looks.of_ray[looks.b].copy()
+    first[:, 0] += looks.grown_a
+    second[:, 0] += looks.grown_b
+    known_a: Bool = np.array(np.isfinite(first).all(axis=1))
+    known_b: Bool = np.array(np.isfinite(second).all(axis=1))
+    mean = np.where((known_a & known_b)[:, None], (first + second) / 2, np.where(known_a[:, None], first, second))
+    teachers = np.flatnonzero(known_a & known_b & (pair > FAINT))
+    result = np.zeros(len(pair))
+    for e in np.flatnonzero(known_a | known_b):
+        free = teachers[(looks.a[teachers] != looks.a[e]) & (looks.b[teachers] != looks.b[e])]
+        weight = pair[free]
+        n = float(weight.sum())
+        if n < LEARNT_FROM:
+            continue
+        ratios = first[free] - second[free]
+        middle = _weighted_median(ratios, weight)
+        deviation = np.abs(ratios - middle)
+        spread = np.maximum(1.4826 * _weighted_median(deviation, weight), LEAST)
+        spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL**2) / (n + USUAL_COUNT))
+        unlike = (UNLIKE[0] + weight[(deviation > FAR * spread).any(axis=1)].sum()) / (UNLIKE[1] + n)
+        marker = _log_kernels(mean[e], mean[free], weight, np.hypot(KIND, spread / 2), n)
+        like = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
+        if known_a[e] and known_b[e]:
+            wider = spread * np.sqrt(1 + 1 / n)
+            like += float((_log_student((first[e] - second[e] - middle) / wider, n) - np.log(wider)).sum())
+        result[e] = np.logaddexp(np.log1p(-unlike) + like, np.log(unlike))
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alone:
+    """Images without a partner.
+
+    Attributes
+    ----------
+    log_density : ndarray of shape (n,)
+        Of their looks, at that of every ray.
+    hidden : float
+        The part of all markers that one focus does not show.
+    """
+
+    log_density: Float
+    hidden: float
+
+
+def images_alone(looks: Looks, paired: Float) -> Alone:
+    """Describe the images without a partner, by what is at hand and by presumed ones: hidden markers, and images that look like anything.
+
+    Parameters
+    ----------
+    looks : Looks
+    paired : ndarray of shape (n,)
+        Probability of the image of every ray to have a partner.
+
+    Returns
+    -------
+    Alone
+    """
+    _, one = np.unique(looks.image, return_index=True)  # on a shared film an image has several rays
+    single, pairs = 1 - paired[one], float(paired[one].sum()) / 2
+    known = np.isfinite(looks.of_ray[one]).all(axis=1)
+    density = np.zeros(len(looks.of_ray))
+    if not known.any() or pairs < 0.5:
+        return Alone(density, _hidden(float(single.sum()), pairs))
+    sample = looks.of_ray[one[known]]
+    middle = _weighted_median(sample, np.ones(len(sample)))
+
+    def broad(value: Float) -> Float:
+        result: Float = (_log_student((value - middle) / WIDE, 3.0) - np.log(WIDE)).sum(axis=-1)
+        return result
+
+    of_pairs = np.maximum(paired[one[known]], 1e-9)
+    alike = np.array([_log_kernels(value, sample, of_pairs, KIND, 2 * pairs) for value in sample])
+    marker = np.ones(len(one))
+    marker[known] = 1 / (1 + np.exp(np.clip(broad(sample) - alike, -50, 50)))
+    hidden = _hidden(float(single @ marker), pairs)
+    presumed = hidden * 2 * pairs
+    total = float(single.sum()) + presumed + UNKNOWN
+    for ray in np.flatnonzero(np.isfinite(looks.of_ray).all(axis=1)):
+        value, w = looks.of_ray[ray], np.where(looks.image[one[known]] != looks.image[ray], single[known], 0.0)
+        parts = [np.log(UNKNOWN) + broad(value)]
+        if w.sum() > 0:
+            parts.append(np.log(w.sum()) + _log_kernels(value, sample, w, KIND, float(w.sum())))
+        # markers look alike: kernels no wider than they must be, lest two hidden ones pass for a pair by their likeness
+        parts.append(np.log(presumed) + _log_density(value, sample, of_pairs, KIND, 2 * pairs))
+        density[ray] = np.logaddexp.reduce(parts) - np.log(total)
+    return Alone(density, hidden)
+
+
+def _hidden(alone: float, pairs: float) -> float:
+    return min((alone + HIDDEN[0]) / (pairs + alone + HIDDEN[1]), 0.5)
+
+
+def _log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: float) -> float:
+    """Return the log of a kernel density estimate; kernels of half of Scott's width, since there may be several kinds of balls."""
+    middle = weight @ sample / weight.sum()
+    spread = np.sqrt(weight @ (sample - middle) ** 2 / weight.sum())
+    return _log_density(value, sample, weight, np.hypot(least, 0.5 * max(n, 1.0) ** (-1 / 6) * spread), n)
+
+
+def _log_density(value: Float, sample: Float, weight: Float, width: Float, n: float) -> float:
+    kernels = (_log_student((value - sample) / width, n) - np.log(width)).sum(axis=1)
+    with np.errstate(divide="ignore"):
+        return float(np.logaddexp.reduce(kernels + np.log(weight / weight.sum())))
+
+
+def _weighted_median(values: Float, weight: Float) -> Float:
+    """Return the median of every column."""
+    order = np.argsort(values, axis=0)
+    total = np.cumsum(weight[order], axis=0)
+    place = (total < total[-1] / 2).sum(axis=0)
+    result: Float = np.take_along_axis(values, np.take_along_axis(order, place[None], axis=0), axis=0)[0]
+    return result
+
+
+def _log_student(t: Float, freedom: float) -> Float:
+    v = max(float(freedom), 2.0)
+    scale = gammaln((v + 1) / 2) - gammaln(v / 2) - 0.5 * np.log(v * np.pi)
+    result: Float = scale - (v + 1) / 2 * np.log1p(np.square(t) / v)
+    return result
