@@ -23,6 +23,7 @@ MISFIT = (
     0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/detection.md
 )
 EXPLAINED = 0.9
+STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
 
 def fit_at(
@@ -104,7 +105,20 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     # little is left of the window beside a saturated area: enough if the ball itself is whole
     seen = ((fits.valid_fraction > 0.3) & (fits.window_fraction > 0.5)) | ((fits.valid_fraction > 0.6) & (fits.window_fraction > 0.05))
     usable = seen & np.isfinite(fits.position_px).all(1)
-    return usable & (misfit(fits, noise) < MISFIT * slack) & (fits.explained > 1 - (1 - EXPLAINED) * slack) & (significance(fits) > 5.0)
+    strength = significance(fits)
+    # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
+    least = 1 - (1 - EXPLAINED) * slack
+    stands_out = strength / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
+    explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
+    return usable & (misfit(fits, noise) < MISFIT * slack) & explained & (strength > 5.0)
+
+
+def explained_over_noise(fits: BallFits) -> Float:
+    """Return the part of the excess over the noise under each ball that the ball explains, shape (n,)."""
+    left = fits.chi2_core
+    raised = left / np.maximum(1.0 - fits.explained, 1e-9)
+    out: Float = 1.0 - np.maximum(left - 1.0, 0.0) / np.maximum(raised - 1.0, 1e-9)
+    return np.where(raised > 1.0, out, 0.0)
 
 
 def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) -> BallFits:
