@@ -23,6 +23,8 @@ ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness f
 _MOST_JUNCTIONS = 80
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _NEAREST_PX = 3.0  # two tips nearer than this are one
+_MOST_PARALLEL = 24  # of those, the ones looked at
+_OUTLYING = 3.0  # standard deviations from which a direction is an error
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
 _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
@@ -67,7 +69,11 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
         tees = [replace(t, angles=_mean_turn(t.angles, offsets) + offsets) for t in tees]
     # with the directions held, the slanted thick ends can no longer turn the arms: they may lend their weight
     tees = fit_all(film, tees, optics, noise, ends=offsets is not None)
-    return [_with_error(t, error) for t in tees if is_tee(t)], [t for t in tees if not is_tee(t) and is_tee(t, slack=ROUGH)], optics
+    clean = [t for t in tees if is_tee(t)]
+    if clean and offsets is not None:
+        effect = _effect_of_directions(film, clean, error, optics, noise)
+        clean = [replace(t, covariance_px2=t.covariance_px2 + effect) for t in clean]
+    return clean, [t for t in tees if not is_tee(t) and is_tee(t, slack=ROUGH)], optics
 
 
 def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> Optics:
@@ -187,19 +193,22 @@ def _common_directions(film: NDArray[Any], tees: list[NeedleFit], optics: Optics
     directions sharpens it. Directions are taken from tees that stand alone, each arm free.
     """
     alone = [c[0] for c in clusters(tees) if len(c) == 1]
-    sample = sorted(alone if len(alone) >= _LEAST_PARALLEL else tees, key=lambda f: f.misfit)[:16]
+    sample = sorted(alone if len(alone) >= _LEAST_PARALLEL else tees, key=lambda f: f.misfit)[:_MOST_PARALLEL]
     if len(sample) < _LEAST_PARALLEL:
         return None, np.zeros(3)
     free = []
     for t in sample:
         others = others_beside(t, [o for o in tees if o is not t], optics, ends=False)
-        fit = fit_needles(film, t.position_px, t.angles, t.shape, optics, noise, others=others, ends=False)
+        fit = fit_needles(film, t.position_px, t.angles, t.shape, optics, noise, others=others, ends=False, quick=True)
         if is_tee(fit, slack=1.5):
             free.append(np.angle(np.exp(1j * (fit.angles - fit.angles[0]))))
     if len(free) < _LEAST_PARALLEL:
         return None, np.zeros(3)
-    spread = 1.4826 * np.median(np.abs(free - np.median(free, axis=0)), axis=0)
-    return np.median(free, axis=0), 1.25 * spread / np.sqrt(len(free))
+    turns = np.array(free)
+    away = np.abs(turns - np.median(turns, axis=0))
+    spread = np.maximum(1.4826 * np.median(away, axis=0), 1e-9)
+    turns = turns[(away < _OUTLYING * spread).all(axis=1)]
+    return turns.mean(axis=0), turns.std(axis=0) / np.sqrt(len(turns) - 1)
 
 
 def _mean_turn(angles: Float, offsets: Float) -> float:
@@ -207,7 +216,13 @@ def _mean_turn(angles: Float, offsets: Float) -> float:
     return turn
 
 
-def _with_error(fit: NeedleFit, direction_error: Float) -> NeedleFit:
-    """Add what errors of the common directions do to the tip: they act at about half an arm's length."""
-    variance = (0.5 * fit.shape.length_px) ** 2 * float((direction_error**2).mean())
-    return replace(fit, covariance_px2=fit.covariance_px2 + variance * np.eye(2))
+def _effect_of_directions(film: NDArray[Any], tees: list[NeedleFit], error: Float, optics: Optics, noise: NoiseModel) -> Float:
+    """Return the covariance of a tip by errors of the common directions, shape (2, 2): shifts of the cleanest tee, each arm turned."""
+    tee = min(tees, key=lambda f: f.misfit)
+    others = others_beside(tee, [t for t in tees if t is not tee], optics, ends=True)
+    effect = np.zeros((2, 2))
+    for k in np.nonzero(error)[0]:
+        start = replace(tee, angles=tee.angles + error[k] * (np.arange(len(error)) == k))
+        shift = fit_crossing(film, [start], optics, noise, others=others)[0].position_px - tee.position_px
+        effect += np.outer(shift, shift)
+    return effect
