@@ -74,13 +74,19 @@ def fit_group(
         slope = slope / (sigma_px * np.maximum(rho, 1e-9))
         return value, -slope * dx, -slope * dy, slope_r / sigma_px
 
+    def linear_part(value: Float) -> Float:
+        # of two balls in one beam the second takes from what the first has left, of two exposures on one film each takes its own: how much
+        # of the product of their images is there, the film tells
+        products = [value[i] * value[j] for i, j in lapping(local, radius, sigma_px)]
+        return np.column_stack([*value, surface, *products])
+
     value, d_col, d_row, d_radius = model()
-    linear = np.column_stack([*value, surface])
+    linear = linear_part(value)
     theta = weighted_least_squares(linear, weight, data, 1e-6)
     if edge:
         bare = (data - value.T @ theta[:k]).reshape(patch.size, patch.size)
         surface = np.column_stack([surface, edge_profile(bare, valid.reshape(bare.shape), sigma_px)])
-        linear = np.column_stack([*value, surface])
+        linear = linear_part(value)
         theta = weighted_least_squares(linear, weight, data, 1e-6)
     converged = False
     for step in range(_STEPS + 1):
@@ -98,7 +104,7 @@ def fit_group(
         radius = np.clip(radius + scale * move[2], low, high)
         converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
         value, d_col, d_row, d_radius = model()
-        linear = np.column_stack([*value, surface])
+        linear = linear_part(value)
         theta = weighted_least_squares(linear, weight, data, 1e-9)
     covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
     influence = (covariance[: 4 * k] @ (jac * np.sqrt(weight)[:, None]).T).reshape(4 * k, patch.size, patch.size)
@@ -127,6 +133,14 @@ def fit_group(
         background=np.full(k, theta[k]),
         converged=np.full(k, converged),
     )
+
+
+def lapping(local: Float, radius: Float, sigma_px: float) -> list[tuple[int, int]]:
+    """Return the pairs of balls whose images lie over each other, by their places (k, 2) and radii (k,)."""
+    k = len(radius)
+    gap = np.hypot(*(local[:, None] - local[None]).transpose(2, 0, 1))
+    over = gap < radius[:, None] + radius[None] + sigma_px
+    return [(i, j) for i in range(k) for j in range(i) if over[i, j]]
 
 
 def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:

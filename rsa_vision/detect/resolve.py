@@ -27,6 +27,8 @@ TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the f
 _MOST_IN_GROUP = 5
 DOUBTFUL = 0.6  # of the misfit that a ball may leave: more may be two balls
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
+_LEAST_KNOWN = 3  # balls that tell what one of them looks like on this film
+_LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
 
@@ -64,6 +66,7 @@ def resolve_balls(
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, good)))
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
+    clean &= ~perhaps_two(single, single.rows(clean), noise)
     sure = single.rows(clean)
     nobody = np.arange(0)
     blobs = single.rows(~clean & ~_taken(single, sure))
@@ -125,6 +128,28 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
         covariance[:, :2, :2] += 0.25 * shift[:, :, None] * shift[:, None, :]
         parts.append(replace(edged, covariance=covariance))
     return join(parts) if parts else fits
+
+
+def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
+    """Say which balls may be two: larger than the film's known ones, and less like a ball than those.
+
+    Parameters
+    ----------
+    fits, known : BallFits
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None where fewer than three are known.
+    """
+    if len(known.depth) < _LEAST_KNOWN:
+        return np.zeros(len(fits.depth), bool)
+    known = known.rows(np.argsort(known.chi2_core)[: max(_LEAST_KNOWN, len(known.depth) // 4)])  # the others may be two themselves
+    left = misfit(fits, noise)
+    n = np.pi * (fits.radius_px + 1) ** 2
+    unlike = (left > _UNLIKE * np.median(misfit(known, noise))) & (left > _LEAST_UNLIKE) & (fits.chi2_core > 1 + 5 * np.sqrt(2 / n))
+    return np.asarray(unlike & (fits.radius_px > _LARGER * np.median(known.radius_px)))
 
 
 def _taken(fits: BallFits, good: BallFits) -> Bool:
