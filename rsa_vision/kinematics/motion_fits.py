@@ -23,6 +23,7 @@ BIRGE_LIMIT: Final = 4.0  # residuals larger than so many times their stated err
 DISTANCE_SIGMA: Final = 3.0  # a change of a distance within so many standard deviations is noise
 CHUNK: Final = 100_000  # markers at once: bounds the memory
 PER_M: Final = 1000.0
+LEFT_OUT: Final = ("duplicate", "predicted", "doubtful")  # why a marker that has coordinates is not used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,10 +139,10 @@ def _fit_block(
 ) -> None:
     """Fit segments with as many markers and the same pairs; fills the rows of `fits`."""
     position, covariance = np.stack([s.position_mm for s in block]), np.stack([s.covariance_mm2 for s in block])
-    duplicate, predicted = np.stack([s.duplicate for s in block]), np.stack([s.predicted for s in block])
+    left_out = {name: np.stack([getattr(s, name) for s in block]) for name in LEFT_OUT}
     if chosen is not None:
         position = np.where(chosen[:, None, :, None], position, np.nan)
-        duplicate, predicted = duplicate & chosen[:, None], predicted & chosen[:, None]
+        left_out = {name: flagged & chosen[:, None] for name, flagged in left_out.items()}
     present: Bool = np.all(np.isfinite(position), axis=3)
     a, b = pairs.T
     seen_a, seen_b = present[:, a], present[:, b]
@@ -151,11 +152,12 @@ def _fit_block(
     some = ~seen_a.any(axis=2) | ~seen_b.any(axis=2)
     codes |= np.where(some & (count < LEAST_POINTS), BIT["segment-missing"], 0)
     codes |= np.where(~some & (count < LEAST_POINTS), BIT["too-few-markers"], 0)
-    codes |= np.where((duplicate[:, a] | duplicate[:, b]).any(axis=2), BIT["marker-duplicate"], 0)
-    codes |= np.where((predicted[:, a] | predicted[:, b]).any(axis=2), BIT["marker-predicted"], 0)
-    wanted = np.ones_like(present[:, 0]) if chosen is None else chosen
-    lost = (wanted[:, None] & ~common & ~(duplicate | predicted)[:, a] & ~(duplicate | predicted)[:, b]).any(axis=2)
-    codes |= np.where(lost & ~some, BIT["marker-missing"], 0)
+    lost = ~common if chosen is None else ~common & chosen[:, None]
+    for name, flagged in left_out.items():
+        either = flagged[:, a] | flagged[:, b]
+        codes |= np.where(either.any(axis=2), BIT[f"marker-{name}"], 0)
+        lost &= ~either
+    codes |= np.where(lost.any(axis=2) & ~some, BIT["marker-missing"], 0)
     fits.count[rows], fits.codes[rows] = count, codes
     order = np.argsort(~common, axis=2, kind="stable")
     for size in np.unique(count[count >= LEAST_POINTS]).tolist():

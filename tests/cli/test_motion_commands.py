@@ -62,6 +62,18 @@ def test_motion_writes_the_published_columns_beside_its_input_or_into_out(marker
     assert not set(left["frame"]) & set(found["frame"])
 
 
+def test_markers_that_are_flagged_are_read_as_such(markers: Path) -> None:
+    table = pl.read_csv(markers, infer_schema=False)
+    third = (pl.col("subject") == "S001") & (pl.col("segment") == "stem") & (pl.col("marker") == "3") & (pl.col("exam") == "202602010900")
+    for flag, reason in (("predicted", "predicted"), ("overlap;loose", "doubtful"), ("ambiguous", "doubtful")):
+        flags = pl.when(third).then(pl.lit(flag)).otherwise(pl.lit(""))
+        table.with_columns(flags=flags).write_csv(markers)
+        found = rsa_vision.motion(markers).table.filter(pl.col("reasons").fill_null("").str.contains(f"marker-{reason}"))
+        assert set(found["n_markers"]) == {5}, flag
+        assert set(found["subject"]) == {"S001"}
+        assert set(found["status"]) == {"ok"}
+
+
 def test_rigidity_has_every_side_of_the_closed_polygon(markers: Path) -> None:
     rsa_vision.motion(markers)
     sides = read(markers.with_name("rigidity.csv"))
@@ -102,8 +114,49 @@ def test_tables_of_other_programs_are_read_with_their_separator(markers: Path, s
 
 
 @pytest.mark.parametrize(
+    "header",
+    [
+        "Patient,Examination,Body,Point,X,Y,Z,SD X,SD Y,SD Z",
+        "patient id;exam date;rigid body;landmark;X [mm];Y [mm];Z [mm];std_x;std_y;std_z",
+        "Case\tVisit\tComponent\tBead\tx (mm)\ty (mm)\tz (mm)\tsigma x [mm]\tsigma y [mm]\tsigma z [mm]",
+    ],
+)
+def test_columns_are_recognised_by_the_names_that_other_programs_give_them(header: str, markers: Path) -> None:
+    separator = max(",;\t", key=header.count)
+    _, *lines = markers.read_text().splitlines()
+    other = markers.with_name("other.csv")
+    other.write_text("\n".join([header, *(line.replace(",", separator) for line in lines)]))
+    found, expected = rsa_vision.motion(other).table, rsa_vision.motion(markers).table
+    assert found.equals(expected)
+
+
+def test_a_marker_can_tell_its_segment(markers: Path) -> None:
+    expected = rsa_vision.motion(markers).table
+    joined = pl.read_csv(markers, infer_schema=False).with_columns(point=pl.col("segment") + "/" + pl.col("marker"))
+    joined.drop("segment", "marker").write_csv(markers)
+    assert rsa_vision.motion(markers).table.equals(expected)
+
+
+def test_dates_of_unclear_order_are_to_be_reviewed_and_others_have_their_days(markers: Path) -> None:
+    table = pl.read_csv(markers, infer_schema=False)
+    months = table["exam"].unique().sort().to_list()
+    table.with_columns(pl.col("exam").replace({name: f"{k}/4/2026" for k, name in enumerate(months, 1)})).write_csv(markers)
+    found = rsa_vision.motion(markers).table
+    assert found["reasons"].str.contains("exam-order-unclear").all()
+    assert set(found["status"]) == {"review"}
+    table.with_columns(pl.col("exam").replace({name: f"2026/04/1{k} 09:30:00" for k, name in enumerate(months)})).write_csv(markers)
+    found = rsa_vision.motion(markers).table
+    assert set(found["status"]) == {"ok"}
+    assert set(found["days"]) == {1.0, 2.0}
+
+
+@pytest.mark.parametrize(
     ("content", "said"),
     [
+        ("exam,segment,marker,x [cm],y [cm],z [cm]\n1,a,1,0,0,0\n", "x [cm] is in cm; give mm, in a column x_mm"),
+        ("exam,segment,marker,x,y,z\n1,a,1,0.01,0.2,0\n1,a,2,0.01,0,0.1\n", "x, y, z do not say their unit and span 0.2; give mm"),
+        ("exam,segment,point,bead,x,y,z\n1,a,1,0,0,0\n", "point and bead may both be the column marker; rename the right one"),
+        ("exam;segment;marker;x;y;z\n1;a;1;0,5;1,234;1.5\n", "y_mm is '1,234', not a number"),
         ("", "not a readable CSV"),
         ("exam,segment,marker,x_mm,y_mm\n1,a,1,0,0\n", "missing columns: z_mm"),
         ("exam,segment,marker,x_mm,y_mm,z_mm\n", "no marker in it"),
