@@ -9,7 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from rsa_vision.api_motion import growth, motion, precision, write_motion
+from rsa_vision.api_motion import export, growth, motion, precision, write_motion
 from rsa_vision.batch import Outcome, Task, run
 from rsa_vision.errors import FilmError, UsageError
 from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
@@ -23,7 +23,20 @@ if TYPE_CHECKING:
     import polars as pl
 
     from rsa_vision.proposal import Proposal
-__all__ = ["Summary", "Watcher", "demo", "detect", "growth", "measure", "motion", "precision", "propose_segments", "reconstruct", "report"]
+__all__ = [
+    "Summary",
+    "Watcher",
+    "demo",
+    "detect",
+    "export",
+    "growth",
+    "measure",
+    "motion",
+    "precision",
+    "propose_segments",
+    "reconstruct",
+    "report",
+]
 
 
 @dataclass(frozen=True, slots=True)
