@@ -364,7 +364,7 @@ def demo(folder: str | Path = "rsa-vision-demo", *, seed: int = 1, watch: Watche
         studies = make_demo(Path(folder), rng=np.random.default_rng(seed))
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from error
-    return [measure(study, study / "results", watch=watch) for study in studies]
+    return [measure(study, study / "results", segments=study / "truth" / "segments.csv", watch=watch) for study in studies]
 
 
 def _followed_up(outcomes: Sequence[Outcome], segments: Segments | None, study: Study) -> list[Outcome]:

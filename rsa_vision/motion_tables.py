@@ -96,7 +96,7 @@ def _table(columns: Mapping[str, Any], schema: Mapping[str, pl.DataType]) -> pl.
 
 def rigidity_table(series: Sequence[Series], stable_mm: float) -> pl.DataFrame:
     """Return ``rigidity.csv``."""
-    return frame(rigidity(series, stable_mm), RIGIDITY)
+    return _table(rigidity(series, stable_mm), RIGIDITY)
 
 
 def group_table(motion: pl.DataFrame, series: Sequence[Series]) -> pl.DataFrame:

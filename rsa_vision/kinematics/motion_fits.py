@@ -122,16 +122,22 @@ def fit_segments(segments: Sequence[Segment], pairs: Sequence[Pairs], limits: Li
         np.full(total, None, object), np.full(total, -1), np.full(total, -1), (), first[:-1],
     )  # fmt: skip
     groups: list[Group] = []
-    alike: dict[tuple[Pairs, int], list[int]] = {}
-    for i, segment in enumerate(segments):
-        if pairs[i]:
-            alike.setdefault((pairs[i], len(segment.markers)), []).append(i)
-    for (common, _), members in alike.items():
+    for common, members in alike(segments, pairs):
         block = [segments[i] for i in members]
         chosen = None if subsets is None else np.stack([subsets[i] for i in members])
         rows = first[members][:, None] + np.arange(len(common))
         _fit_block(fits, groups, block, np.array(common), rows, chosen, limits)
     return Fits(**{name: getattr(fits, name) for name in Fits.__dataclass_fields__ if name != "groups"}, groups=tuple(groups))
+
+
+def alike(segments: Sequence[Segment], pairs: Sequence[Pairs]) -> Iterator[tuple[Pairs, list[int]]]:
+    """Yield pairs of examinations with all segments, by their indices, that have these pairs and as many markers: what one array can hold."""
+    blocks: dict[tuple[Pairs, int], list[int]] = {}
+    for i, segment in enumerate(segments):
+        if pairs[i]:
+            blocks.setdefault((pairs[i], len(segment.markers)), []).append(i)
+    for (common, _), members in blocks.items():
+        yield common, members
 
 
 def _fit_block(
