@@ -131,7 +131,7 @@ def fit_segments(segments: Sequence[Segment], pairs: Sequence[Pairs], limits: Li
 
 
 def alike(segments: Sequence[Segment], pairs: Sequence[Pairs]) -> Iterator[tuple[Pairs, list[int]]]:
-    """Yield pairs of examinations with all segments, by their indices, that have these pairs and as many markers: what one array can hold."""
+    """Yield pairs of examinations with all segments, by their indices, that have these pairs and as many markers: one array holds them."""
     blocks: dict[tuple[Pairs, int], list[int]] = {}
     for i, segment in enumerate(segments):
         if pairs[i]:
