@@ -249,6 +249,7 @@ def test_growth_between_two_times_has_stated_errors_that_are_true(markers: Path)
 
 def test_ten_thousand_motions_take_a_second(tmp_path: Path) -> None:
     from rsa_vision.kinematics.kinema import motions
+    from rsa_vision.kinematics.rigidity import rigidity
     from rsa_vision.kinematics.series import make_series
     from rsa_vision.settings import Limits, Motion
 
@@ -257,7 +258,9 @@ def test_ten_thousand_motions_take_a_second(tmp_path: Path) -> None:
     series = make_series(table([one] * 10_000, rng, np.eye(3) * 1e-4))
     started = time.process_time()
     found = motions(series, Motion(), Limits(condition_number=1e4))
+    sides = rigidity(series, 0.35)
     assert time.process_time() - started < 2.0  # 0.7 s where nothing else runs
+    assert len(sides["marker"]) == 50_000
     assert len(found["status"]) == 10_000
 
 
@@ -290,6 +293,37 @@ def test_a_run_with_known_segments_ends_with_motion_in_its_report(markers: Path,
     assert "a &lt;stem&gt;" in page
     assert "36 motions: 36 ok" in page
     assert "set posture in [report]" in page
+    assert "Groups" in page
+    assert "open circles" not in page
+    loosened = pl.read_csv(markers, infer_schema=False)
+    third = (pl.col("subject") == "S001") & (pl.col("segment") == "stem") & (pl.col("marker") == "3") & (pl.col("exam") == "202602010900")
+    loosened = loosened.with_columns(x_mm=pl.when(third).then(pl.lit("500")).otherwise("x_mm")).filter(pl.col("subject") == "S001")
+    loosened.write_csv(out / "markers.csv")
+    api.write_motion(out, study)
+    frame([], SCHEMAS["markers"]).write_csv(out / "markers.csv")
+    page = api.report(out).read_text()
+    assert "open circles are motions to be reviewed" in page
+    assert "Groups" not in page  # of one subject
+
+
+def test_continuous_migration_is_told_of_motions_that_are_ok_alone(tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    exams = {"202601010900": "20240101", "202602010900": "20250101", "202603010900": "20260101"}
+    bodies = subject(rng, exams=3, segments=("bone", "stem"), markers=5, angle_deg=0, shift_mm=0)
+    bodies.shift[1, "stem"][1], bodies.shift[2, "stem"][1] = -0.5, -1.0
+    path = write(tmp_path / "markers.csv", [bodies], rng, exams)
+
+    def told() -> dict[tuple[str, str], bool | None]:
+        table = rsa_vision.motion(path, reference="bone").table
+        rows = table.filter((pl.col("segment") == "stem") & (pl.col("reference") == "bone"))
+        return {(row["exam_from"], row["exam_to"]): row["continuous"] for row in rows.to_dicts()}
+
+    late = ("20250101", "20260101")
+    assert told() == {("20240101", "20250101"): None, ("20240101", "20260101"): None, late: True}
+    table = pl.read_csv(path, infer_schema=False)
+    first = (pl.col("segment") == "stem") & (pl.col("marker") == "1") & (pl.col("exam") == "20260101")
+    table.with_columns(y_mm=pl.when(first).then(pl.lit("99")).otherwise("y_mm")).write_csv(path)
+    assert told()[late] is None
 
 
 def test_a_table_with_a_row_for_each_frame_is_read_as_xmalab_writes_it(markers: Path) -> None:
