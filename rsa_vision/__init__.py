@@ -1,7 +1,7 @@
 """Folders of radiographs in, three-dimensional marker coordinates with honest uncertainty out.
 
 Every command of ``rsa-vision`` is a function here: :func:`measure`, :func:`detect`, :func:`reconstruct`, :func:`motion`,
-:func:`growth`, :func:`precision`, :func:`report`, :func:`demo`.
+:func:`growth`, :func:`precision`, :func:`export`, :func:`report`, :func:`demo`.
 They are loaded when first used, so that ``import rsa_vision`` costs nothing.
 """
 
@@ -12,7 +12,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, Final
 
-_COMMANDS: Final = frozenset({"measure", "detect", "reconstruct", "report", "demo", "motion", "growth", "precision"})
+_COMMANDS: Final = frozenset({"measure", "detect", "reconstruct", "report", "demo", "motion", "growth", "precision", "export"})
 _LAZY: Final = {
     **dict.fromkeys(_COMMANDS, "rsa_vision.api"),
     "Summary": "rsa_vision.api",

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from rsa_vision.api_motion import growth, motion, precision, write_motion
+from rsa_vision.api_motion import export, growth, motion, precision, write_motion
 from rsa_vision.batch import Outcome, Task, run
 from rsa_vision.errors import FilmError, UsageError
 from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
@@ -23,7 +23,20 @@ if TYPE_CHECKING:
     import polars as pl
 
     from rsa_vision.proposal import Proposal
-__all__ = ["Summary", "Watcher", "demo", "detect", "growth", "measure", "motion", "precision", "propose_segments", "reconstruct", "report"]
+__all__ = [
+    "Summary",
+    "Watcher",
+    "demo",
+    "detect",
+    "export",
+    "growth",
+    "measure",
+    "motion",
+    "precision",
+    "propose_segments",
+    "reconstruct",
+    "report",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,7 +364,7 @@ def demo(folder: str | Path = "rsa-vision-demo", *, seed: int = 1, watch: Watche
         studies = make_demo(Path(folder), rng=np.random.default_rng(seed))
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror}); choose another folder") from error
-    return [measure(study, study / "results", watch=watch) for study in studies]
+    return [measure(study, study / "results", segments=study / "truth" / "segments.csv", watch=watch) for study in studies]
 
 
 def _followed_up(outcomes: Sequence[Outcome], segments: Segments | None, study: Study) -> list[Outcome]:

@@ -1,4 +1,4 @@
-"""``motion``, ``growth`` and ``precision`` as functions: they start from tables of markers."""
+"""``motion``, ``growth``, ``precision`` and ``export`` as functions: they start from tables of markers."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from rsa_vision.errors import SettingsError, UsageError
+from rsa_vision.exchange import Frames, encode, frames_of
 from rsa_vision.kinematics.series import MarkerTable, make_series
 from rsa_vision.marker_files import MarkerFile, read_markers
 from rsa_vision.motion_tables import (
@@ -22,12 +23,13 @@ from rsa_vision.motion_tables import (
     write_motion_tables,
 )
 from rsa_vision.settings import Motion, Study, describe_validation, load_study
-from rsa_vision.store import read_run
+from rsa_vision.store import read_run, write_atomic
 from rsa_vision.tables import SCHEMAS
 
 if TYPE_CHECKING:
     import polars as pl
 
+UNNAMED: Final = "-"  # stands for the segment of markers without one
 REMEDY: Final = "fill in the column segment, or give the known segments when measuring"
 
 
@@ -217,6 +219,41 @@ def precision(source: str | Path, out: str | Path | None = None, *, reference: s
     return MotionSummary(place, table, given.unnamed)
 
 
+def export(source: str | Path, out: str | Path, *, format_name: str | None = None, subject: str | None = None) -> Frames:
+    """Write the markers of a subject for programs of motion analysis: each examination is a frame.
+
+    Parameters
+    ----------
+    source : path
+        Results folder, or a CSV file of markers.
+    out : path
+        The file.
+    format_name : str, optional
+        ``trc``, ``c3d`` (needs the package ezc3d) or ``xmalab``; default: by the suffix of the file (``.trc``, ``.c3d``, ``.csv``).
+    subject : str, optional
+        Needed where the input has several.
+
+    Returns
+    -------
+    Frames
+        What was written. Markers that motion does not use (predicted, loose, ambiguous, twice in an examination) are missing in it.
+
+    Raises
+    ------
+    RsaError
+        If the input cannot be read, the subject or the format is not known, or the file cannot be written.
+    """
+    given = read_markers(Path(source))
+    series = {one.subject: one for one in make_series(_all_named(given), given.status)}
+    chosen = next(iter(series)) if subject is None and len(series) == 1 else subject
+    if chosen not in series:
+        which = "several subjects" if subject is None else f"no subject {subject!r}"
+        raise UsageError(f"{source}: there {'are' if subject is None else 'is'} {which}; choose with --subject: {', '.join(series)}")
+    frames = frames_of(series[chosen], UNNAMED)
+    write_atomic(Path(out), encode(frames, Path(out), format_name))
+    return frames
+
+
 def _require_segments(given: MarkerFile) -> None:
     if given.unnamed == len(given.markers):
         raise UsageError(f"{given.path}: no marker has a segment, and motion is that of segments; {REMEDY}")
@@ -224,7 +261,7 @@ def _require_segments(given: MarkerFile) -> None:
 
 def _all_named(given: MarkerFile) -> MarkerTable:
     """Lengths need no segments: points without one count as one model."""
-    segment = np.where(given.markers.segment == "", "-", given.markers.segment)
+    segment = np.where(given.markers.segment == "", UNNAMED, given.markers.segment)
     return replace(given.markers, segment=segment) if given.unnamed else given.markers
 
 

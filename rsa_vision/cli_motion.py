@@ -1,4 +1,4 @@
-"""The commands that start from markers: motion, growth, precision."""
+"""The commands that start from markers: motion, growth, precision, export."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Reference = Annotated[str | None, typer.Option("--reference", help="Segment to w
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
-    for command in (motion, growth, precision):
+    for command in (motion, growth, precision, export):
         app.command()(command)
 
 
@@ -77,6 +77,23 @@ def precision(source: Source, out: Out = None, reference: Reference = None) -> i
             print(f"{name}: n {row['n']}  mean {row['mean']:.4f}{spread}  from zero {row['from_zero']:.4f}")
     _finish(summary, "line", "precision.csv")
     return int(bool((summary.table["n_left_out"] > 0).any()))
+
+
+def export(
+    source: Source,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
+    format_name: Annotated[
+        str | None, typer.Option("--format", help="Default: by the suffix of the file.", metavar="trc|c3d|xmalab")
+    ] = None,
+    subject: Annotated[str | None, typer.Option("--subject", help="Needed where there are several.")] = None,
+) -> int:
+    """Write markers for programs of motion analysis: each examination is a frame."""
+    from rsa_vision import api
+
+    frames = api.export(source, out, format_name=format_name, subject=subject)
+    missing = f", {frames.n_missing} places missing" if frames.n_missing else ""
+    print(f"{len(frames.names)} markers in {len(frames.exams)} frames{missing} -> {out}")
+    return 0
 
 
 def _finish(summary: MotionSummary, noun: str, file: str) -> None:

@@ -11,12 +11,11 @@ import numpy as np
 import polars as pl
 
 from rsa_vision.errors import PointsError, UsageError
+from rsa_vision.flags import flag_value
 from rsa_vision.kinematics.series import MarkerTable
+from rsa_vision.marker_columns import DEVIATIONS, PLACE, PRODUCTS, recognise
 from rsa_vision.types import Bool, Float
 
-PLACE: Final = ("x_mm", "y_mm", "z_mm")
-DEVIATIONS: Final = ("sd_x_mm", "sd_y_mm", "sd_z_mm")
-PRODUCTS: Final = {"cov_xy_mm2": (0, 1), "cov_xz_mm2": (0, 2), "cov_yz_mm2": (1, 2)}
 MOST_ERRORS: Final = 20  # of a wrong file that are printed
 LARGEST: Final = 1e6  # mm; nothing in a radiograph is a kilometre away
 ROUNDING: Final = 1e-6  # of a covariance in print
@@ -56,9 +55,9 @@ def read_markers(source: Path, *, standard: bool = False, own: bool = False) -> 
     ----------
     source : Path
         A folder of results, or a CSV file with the columns exam, segment, marker, x_mm, y_mm, z_mm. Optional: subject, sd_x_mm ..,
-        cov_xy_mm2 .., flags (``predicted`` markers are not used); other columns are ignored. The separator may be a comma, a semicolon
-        (with decimal commas or points) or a tab. Empty or NaN coordinates mean *not determined*. A table with a row for each frame and the
-        columns NAME_X, NAME_Y, NAME_Z (as XMALab exports points) is read, too: frames are examinations, NAME may be ``segment/marker``.
+        cov_xy_mm2 .., flags; other columns are ignored. Names and arrangements of other programs are recognised
+        (:func:`rsa_vision.marker_columns.recognise`). The separator may be a comma, a semicolon or a tab. Empty or NaN coordinates mean
+        *not determined*.
     standard : bool
         The columns subject, exam and segment may be missing.
     own : bool
@@ -80,8 +79,7 @@ def read_markers(source: Path, *, standard: bool = False, own: bool = False) -> 
     if not path.is_file():
         what = "no markers.csv in it; measure the films first" if source.is_dir() else "no such file or folder"
         raise UsageError(f"{source}: {what}, or give a CSV file of markers")
-    table = _read_csv(path)
-    table = _long(table)
+    table = recognise(str(path), _read_csv(path))
     if not len(table) and not own:
         raise PointsError(f"{path}: there is no marker in it")
     markers = _check(path, table, standard, own)
@@ -106,37 +104,15 @@ def _read_csv(path: Path) -> pl.DataFrame:
     except pl.exceptions.PolarsError as error:
         reason = str(error).split("\n", 1)[0]
         raise PointsError(f"{path}: not a readable CSV file ({reason})") from error
-    table = table.rename({old: old.strip() for old in table.columns if old != old.strip()}).select(pl.all().str.strip_chars())
-    if separator == ";":
-        numbers = [name for name in table.columns if name in (*PLACE, *DEVIATIONS, *PRODUCTS)]
-        table = table.with_columns(pl.col(numbers).str.replace(",", ".", literal=True))
-    return table
-
-
-def _long(table: pl.DataFrame) -> pl.DataFrame:
-    """Return a table with a row for each frame and the columns ``NAME_X``, ``NAME_Y``, ``NAME_Z`` as one with a row for each marker.
-
-    XMALab and others write points so. The number of the frame is the examination, ``segment/marker`` in NAME tells the segment.
-    """
-    triples = {name[:-2]: [f"{name[:-2]}{end}" for end in (name[-2:], "_Y", "_Z")] for name in table.columns if name.endswith("_X")}
-    whole = {name: columns for name, columns in triples.items() if set(columns) <= set(table.columns)}
-    if "marker" in table.columns or not whole:
-        return table
-    exams = [str(k + 1) for k in range(len(table))]
-    parts = [
-        pl.DataFrame({"exam": exams, "segment": name.rpartition("/")[0], "marker": name.rpartition("/")[2]}).with_columns(
-            table[column].alias(target) for column, target in zip(columns, PLACE, strict=True)
-        )
-        for name, columns in whole.items()
-    ]
-    return pl.concat(parts)
+    return table.rename({old: old.strip() for old in table.columns if old != old.strip()}).select(pl.all().str.strip_chars())
 
 
 def _check(path: Path, table: pl.DataFrame, standard: bool, own: bool) -> MarkerTable:
     free = ("subject", "exam", "segment") if standard else ("subject",)
     wanted = [name for name in ("subject", "exam", "segment", "marker", *PLACE) if name not in free]
     if missing := [name for name in wanted if name not in table.columns]:
-        raise PointsError(f"{path}: missing columns: {', '.join(missing)}; there are {', '.join(table.columns) or 'none'}")
+        there = ", ".join(table.columns) or "none"
+        raise PointsError(f"{path}: missing columns: {', '.join(missing)}; there are {there}; rename those that are meant")
     problems: list[tuple[int, str]] = []
 
     def text(name: str, needed: bool = False) -> Any:
@@ -169,9 +145,10 @@ def _check(path: Path, table: pl.DataFrame, standard: bool, own: bool) -> Marker
         lines = [f"  line {row + 2}: {problem}" for row, problem in sorted(problems)]
         more = [f"  and {len(lines) - MOST_ERRORS} more"] if len(lines) > MOST_ERRORS else []
         raise PointsError(f"{path}: wrong values\n" + "\n".join(lines[:MOST_ERRORS] + more))
-    predicted = table["flags"].fill_null("").str.split(";").list.contains("predicted").to_numpy() if "flags" in table.columns else None
+    known, where = np.unique(text("flags"), return_inverse=True)
+    flags = np.array([flag_value(names) for names in known.tolist()], np.int64)[where]
     subject, exam, segment, marker = names
-    return MarkerTable(subject, exam, segment, marker, position, covariance, np.zeros(len(table), bool) if predicted is None else predicted)
+    return MarkerTable(subject, exam, segment, marker, position, covariance, flags)
 
 
 def _valid(covariance: Float, deviation: Float) -> Bool:

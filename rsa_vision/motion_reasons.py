@@ -22,8 +22,13 @@ MOTION_REASONS: Final[dict[str, tuple[str, str]]] = {
     "reference-review": ("review", "the reference segment is to be reviewed; its own row says why"),
     "euler-singular": ("review", "the rotation about y is 90 degrees: rx and rz are not told apart; use the screw axis"),
     "exams-out-of-order": ("review", "by its name the later examination is the earlier one; look at the names"),
+    "exam-order-unclear": (
+        "review",
+        "names of examinations are dates with the day or month first: their order is not told; use yyyy-mm-dd",
+    ),
     "marker-missing": ("ok", "a marker has no coordinates in one of the examinations; the others were used"),
     "marker-predicted": ("ok", "a marker was placed by the known segment, not by rays; it was left out"),
+    "marker-doubtful": ("ok", "a marker is flagged loose or ambiguous: it may have moved in its bone, or be another one; it was left out"),
     "screw-undefined": ("ok", "the rotation is zero within its error: no direction of the screw axis"),
     "sd-from-residuals": ("ok", "the input has no covariances: standard deviations come from the residuals"),
 }

@@ -81,7 +81,7 @@ def motion_table(series: Sequence[Series], settings: Motion, limits: Limits, *, 
 
 def _continuous(columns: Columns, start: np.ndarray[Any, Any], limit_mm: float) -> np.ndarray[Any, Any]:
     """After the first year: whether the motion of a year is above the limit beyond its error (MTPM, after Ryd 1995)."""
-    asked = (start >= SETTLED_DAYS) & (columns["days"] >= INTERVAL_DAYS) & (columns["reference"] != "") & (columns["status"] != "failed")
+    asked = (start >= SETTLED_DAYS) & (columns["days"] >= INTERVAL_DAYS) & (columns["reference"] != "") & (columns["status"] == "ok")
     per_year = columns["mtpm_low_mm"] * YEAR_DAYS / np.where(asked, columns["days"], np.nan)
     return np.array([bool(value > limit_mm) if ask else None for value, ask in zip(per_year, asked, strict=True)], object)
 
@@ -96,7 +96,7 @@ def _table(columns: Mapping[str, Any], schema: Mapping[str, pl.DataType]) -> pl.
 
 def rigidity_table(series: Sequence[Series], stable_mm: float) -> pl.DataFrame:
     """Return ``rigidity.csv``."""
-    return frame(rigidity(series, stable_mm), RIGIDITY)
+    return _table(rigidity(series, stable_mm), RIGIDITY)
 
 
 def group_table(motion: pl.DataFrame, series: Sequence[Series]) -> pl.DataFrame:

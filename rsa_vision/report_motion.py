@@ -14,12 +14,19 @@ from rsa_vision.motion_tables import PARAMETERS, PRECISION, QUALITY, read_motion
 from rsa_vision.tables import Row
 
 COLOURS: Final = ("#0b6fa4", "#c25e00", "#3d8f4f", "#8a4fb5", "#a8325e", "#6b6f00", "#257d7d", "#5a5a5a")
-PLOT_PX: Final = (330, 210)
-MARGIN_PX: Final = (46, 12, 14, 26)  # left, right, top, bottom
+PLOT_PX: Final = (260, 175)
+MARGIN_PX: Final = (38, 10, 12, 24)  # left, right, top, bottom
 MOST_LINES: Final = 24  # subjects that a plot shows one by one
+FEW_LINES: Final = 3  # whose bands can be told apart
 MOST_ROWS: Final = 200
 WITHIN_95: Final = 1.96
 TITLES: Final = {"r": "Rotation about {} (deg)", "t": "Translation along {} (mm)", "m": "MTPM (mm)"}
+QUALITY_TITLES: Final = {
+    "e_rb_mm": "Error of rigid-body fitting, root mean square (e_rb_mm)",
+    "mean_error_mm": "Mean error of rigid-body fitting (mean_error_mm)",
+    "condition_number": "Condition number",
+    "n_markers": "Markers of a segment",
+}
 ASKED: Final = {
     "implant": "Implant and its marking",
     "surgery_to_first_days": "Days from surgery to the first examination",
@@ -46,16 +53,20 @@ def motion_section(out: Path, settings: Mapping[str, Any]) -> dict[str, Any] | N
         return None
     rows = motion.with_columns(pl.col("reference", "reasons", "subject").fill_null("")).to_dicts()
     groups = tables["motion_groups"].with_columns(pl.col("reference").fill_null("")).to_dicts() if "motion_groups" in tables else []
-    worst = sorted(rows, key=lambda row: ("failed", "review", "ok").index(row["status"]))
+    worst = sorted(rows, key=lambda row: (("failed", "review", "ok").index(row["status"]), not row["reference"]))
+    compared = [row for row in groups if row["parameter"] in PARAMETERS and (row["reference"] or not any(g["reference"] for g in groups))]
     codes = dict.fromkeys(code for row in rows for code in row["reasons"].split(";") if code)
     precision = tables["precision"].filter(pl.col("kind") == "motion") if "precision" in tables else pl.DataFrame(schema=dict(PRECISION))
+    plots = _plots(rows)
     return {
         "rows": worst[:MOST_ROWS],
         "n": len(rows),
         "counts": {status: sum(row["status"] == status for row in rows) for status in ("ok", "review", "failed")},
         "reasons": {code: MOTION_REASONS[code][1] for code in codes if code in MOTION_REASONS},
-        "plots": _plots(rows),
-        "groups": [row for row in groups if row["n"]],
+        "plots": plots,
+        "doubtful": any(panel["doubtful"] for plot in plots for panel in plot["panels"]),
+        "groups": [row for row in compared if row["n"]] if any(row["n"] > 1 for row in compared) else [],
+        "relative": any(row["reference"] for row in rows),
         "continuous": [row for row in rows if row["continuous"]],
         "precision": [row for row in precision.with_columns(pl.col("reference").fill_null("")).to_dicts() if row["n"]],
         "checklist": _checklist(rows, settings, precision),
@@ -73,7 +84,9 @@ def _plots(rows: Sequence[Row]) -> list[dict[str, Any]]:
     for segment, reference in dict.fromkeys((row["segment"], row["reference"]) for row in relative):
         mine = [row for row in relative if (row["segment"], row["reference"]) == (segment, reference)]
         panels = [_panel(mine, name) for name in PARAMETERS]
-        plots.append({"segment": segment, "reference": reference, "panels": panels, "dated": all(row["days"] is not None for row in mine)})
+        subjects = [(line["subject"], line["colour"]) for line in panels[0]["lines"]]
+        legend = subjects if 1 < len(subjects) <= len(COLOURS) else []
+        plots.append({"segment": segment, "reference": reference, "panels": panels, "legend": legend})
     return plots
 
 
@@ -81,11 +94,14 @@ def _panel(rows: Sequence[Row], name: str) -> dict[str, Any]:
     """Return the lines and confidence bands of one parameter, in pixels."""
     dated = all(row["days"] is not None for row in rows)
     lines: dict[str, list[tuple[float, float, float, float]]] = {}
+    doubtful: set[tuple[str, float]] = set()
     for row in rows:
         if row[name] is not None:
             line = lines.setdefault(row["subject"], [(0.0, 0.0, 0.0, 0.0)])
             low, high = _band(row, name)
             line.append((row["days"] if dated else float(len(line)), row[name], low, high))
+            if row["status"] != "ok":
+                doubtful.add((row["subject"], line[-1][0]))
     every = np.array([point for line in lines.values() for point in line] or [(0.0, 0.0, 0.0, 0.0)])
     left, right, top, bottom = MARGIN_PX
     width, height = PLOT_PX
@@ -99,16 +115,18 @@ def _panel(rows: Sequence[Row], name: str) -> dict[str, Any]:
         return round(height - bottom - (height - top - bottom) * (value - low) / (high - low), 1)
 
     drawn = []
+    opacity = 0.13 if len(lines) <= FEW_LINES else 0.05
     for place, (subject, line) in enumerate(list(lines.items())[:MOST_LINES]):
         points = sorted(line)
         upper, lower = [f"{x(p[0])},{y(p[3])}" for p in points], [f"{x(p[0])},{y(p[2])}" for p in reversed(points)]
         drawn.append(
             {
                 "subject": subject,
+                "opacity": opacity,
                 "colour": COLOURS[place % len(COLOURS)],
                 "band": " ".join(upper + lower),
                 "line": " ".join(f"{x(p[0])},{y(p[1])}" for p in points),
-                "points": [{"x": x(p[0]), "y": y(p[1])} for p in points],
+                "points": [{"x": x(p[0]), "y": y(p[1]), "doubtful": (subject, p[0]) in doubtful} for p in points],
             }
         )
     step = _step(high - low)
@@ -125,6 +143,7 @@ def _panel(rows: Sequence[Row], name: str) -> dict[str, Any]:
         "ticks": ticks,
         "end": f"{end:.0f} days" if dated else "examinations",
         "more": max(len(lines) - MOST_LINES, 0),
+        "doubtful": bool(doubtful),
     }
 
 
@@ -170,7 +189,12 @@ def _checklist(rows: Sequence[Row], settings: Mapping[str, Any], precision: pl.D
         values = np.array([row[name] for row in rows if row[name] is not None], float)
         limit = f"; limit {limits[name]:g}" if name in limits else ""
         if len(values):
-            items.append((name, f"median {np.median(values):.3g}, range {values.min():.3g} to {values.max():.3g} {unit}{limit}".strip()))
+            items.append(
+                (
+                    QUALITY_TITLES[name],
+                    f"median {np.median(values):.3g}, range {values.min():.3g} to {values.max():.3g} {unit}{limit}".strip(),
+                )
+            )
     doubles = int(precision["n"].max() or 0) if len(precision) else 0  # type: ignore[arg-type]  # a column of integers
     items.append(("Double examinations", str(doubles) if doubles else "none: run rsa-vision precision when there are"))
     items += [(title, given.get(key, f"— set {key} in [report] of study.toml")) for key, title in ASKED.items()]

@@ -10,9 +10,9 @@ import numpy as np
 from synthetic.study import make_study
 
 CAGES: Final[dict[str, dict[str, Any]]] = {
-    "1A": {"n_exams": 3, "response": "density", "bits": 16, "bone": True, "scatter": 0.2},
-    "1B": {"n_exams": 2, "response": "transmission", "bits": 12},
-    "2": {"n_exams": 3, "response": "linear", "bits": 16, "extension": "dcm"},
+    "1A": {"n_exams": 3, "interval_days": 182, "response": "density", "bits": 16, "bone": True, "scatter": 0.2},
+    "1B": {"n_exams": 2, "interval_days": 182, "response": "transmission", "bits": 12},
+    "2": {"n_exams": 3, "interval_days": 182, "response": "linear", "bits": 16, "extension": "dcm"},
 }
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import polars as pl
@@ -20,6 +21,8 @@ from synthetic.scanner import FilmCurve, Response, Scanner, add_quantum_noise, d
 from synthetic.scene import TANTALUM_PER_MM, ObjectMarker, Scene, missing_by_focus, object_box, place_objects, shift_foci
 from synthetic.truth import truth_tables
 from synthetic.write import Values, write_film, write_truth
+
+FIRST_EXAM: Final = datetime(2026, 1, 1, 9)  # local time, as names of films tell it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,6 +206,7 @@ def make_study(
     *,
     rng: np.random.Generator,
     n_exams: int = 2,
+    interval_days: int = 1,
     subjects: Sequence[str] = ("S01",),
     segments: Mapping[str, int] | None = None,
     motion: Motion | None = None,
@@ -220,7 +224,9 @@ def make_study(
     cage : Cage, or name or path of one
     rng : numpy Generator
     n_exams : int
-        Examinations of each subject, one day apart.
+        Examinations of each subject.
+    interval_days : int
+        From each to the next.
     subjects : sequence of str
     segments : mapping of str to int, optional
         Number of balls in each segment; default: bone 7, implant 6.
@@ -244,9 +250,10 @@ def make_study(
     paths: list[Path] = []
     tables: dict[str, list[pl.DataFrame]] = {"images": [], "foci": [], "markers": [], "segments": []}
     for subject in subjects:
-        for day in range(n_exams):
-            named: dict[str, Any] = {"rng": rng, "subject": subject, "exam": f"2026{1 + day // 28:02d}{1 + day % 28:02d}0900"}
-            if day == 0:
+        for k in range(n_exams):
+            exam = f"{FIRST_EXAM + timedelta(k * interval_days):%Y%m%d%H%M}"
+            named: dict[str, Any] = {"rng": rng, "subject": subject, "exam": exam}
+            if k == 0:
                 shot = render_examination(loaded, **named, **{"segments": segments, **options})
                 columns = ["subject", "segment", "marker", "x_mm", "y_mm", "z_mm"]
                 tables["segments"].append(shot.markers.select(columns))

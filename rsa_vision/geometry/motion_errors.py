@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rsa_vision.geometry.rigid import RigidFits
 from rsa_vision.geometry.screw import SINGLE, _cross
@@ -107,7 +107,7 @@ def _birge(turned_mm: Float, squares_mm2: Float, expected_mm2: Float) -> Float:
     freedom = trace**2 / (remaining * remaining.transpose(0, 2, 1)).sum(axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = squares_mm2 / trace
-    significant = ratio * freedom > chi2.isf(SIGNIFICANCE, freedom)
+    significant = ratio * freedom > chdtri(freedom, SIGNIFICANCE)
     result: Float = np.where(significant, np.sqrt(np.maximum(ratio, 1.0)), 1.0)
     return result
 

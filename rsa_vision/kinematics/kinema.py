@@ -16,7 +16,7 @@ from rsa_vision.geometry.screw import find_screws, screw_jacobians
 from rsa_vision.kinematics.consistent import consistent_subsets
 from rsa_vision.kinematics.frames import frame_matrix, frame_name, in_frame
 from rsa_vision.kinematics.motion_fits import Fits, Pairs, fit_segments
-from rsa_vision.kinematics.series import Segment, Series
+from rsa_vision.kinematics.series import Segment, Series, order_is_unclear
 from rsa_vision.motion_reasons import BIT, FAILURE_BITS, REVIEW_BITS, joined, status_of
 from rsa_vision.settings import Limits, Motion
 from rsa_vision.types import Bool, Float, Int
@@ -26,7 +26,6 @@ PairsOf = Callable[[Series], Pairs]
 ANGLE_SIGMA: Final = 5.0  # a rotation within so many standard deviations of zero has no axis: nearer, errors of first order are not true
 SINGULAR_SIGMA: Final = 5.0  # psi within so many of +-90 degrees does not tell phi from theta
 AXES: Final = "xyz"
-OF_SEGMENT: Final = ("marker-missing", "marker-predicted", "marker-duplicate", "sd-from-residuals")
 ABSOLUTE: Final = -1
 UNKNOWN: Final = -2
 
@@ -157,6 +156,8 @@ def _exam_codes(series: Sequence[Series], rows: _Rows, frames: Sequence[Float]) 
     a, b = (offset[rows.series] + end for end in rows.pair.T)
     lost = np.array([not np.isfinite(frame).all() for frame in frames], bool)[rows.series]
     early = np.where(days[b] < days[a], BIT["exams-out-of-order"], 0)
+    unclear = np.array([order_is_unclear(exam) for one in series for exam in one.exams], bool)
+    early |= np.where(unclear[a] | unclear[b], BIT["exam-order-unclear"], 0)
     result: Int = state[a] | state[b] | early | np.where(lost, BIT["frame-undefined"], 0)
     return result
 

@@ -23,6 +23,7 @@ BIRGE_LIMIT: Final = 4.0  # residuals larger than so many times their stated err
 DISTANCE_SIGMA: Final = 3.0  # a change of a distance within so many standard deviations is noise
 CHUNK: Final = 100_000  # markers at once: bounds the memory
 PER_M: Final = 1000.0
+LEFT_OUT: Final = ("duplicate", "predicted", "doubtful")  # why a marker that has coordinates is not used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,11 +122,7 @@ def fit_segments(segments: Sequence[Segment], pairs: Sequence[Pairs], limits: Li
         np.full(total, None, object), np.full(total, -1), np.full(total, -1), (), first[:-1],
     )  # fmt: skip
     groups: list[Group] = []
-    alike: dict[tuple[Pairs, int], list[int]] = {}
-    for i, segment in enumerate(segments):
-        if pairs[i]:
-            alike.setdefault((pairs[i], len(segment.markers)), []).append(i)
-    for (common, _), members in alike.items():
+    for common, members in alike(segments, pairs):
         block = [segments[i] for i in members]
         chosen = None if subsets is None else np.stack([subsets[i] for i in members])
         rows = first[members][:, None] + np.arange(len(common))
@@ -133,15 +130,25 @@ def fit_segments(segments: Sequence[Segment], pairs: Sequence[Pairs], limits: Li
     return Fits(**{name: getattr(fits, name) for name in Fits.__dataclass_fields__ if name != "groups"}, groups=tuple(groups))
 
 
+def alike(segments: Sequence[Segment], pairs: Sequence[Pairs]) -> Iterator[tuple[Pairs, list[int]]]:
+    """Yield pairs of examinations with all segments, by their indices, that have these pairs and as many markers: one array holds them."""
+    blocks: dict[tuple[Pairs, int], list[int]] = {}
+    for i, segment in enumerate(segments):
+        if pairs[i]:
+            blocks.setdefault((pairs[i], len(segment.markers)), []).append(i)
+    for (common, _), members in blocks.items():
+        yield common, members
+
+
 def _fit_block(
     fits: Fits, groups: list[Group], block: Sequence[Segment], pairs: Int, rows: Int, chosen: Bool | None, limits: Limits
 ) -> None:
     """Fit segments with as many markers and the same pairs; fills the rows of `fits`."""
     position, covariance = np.stack([s.position_mm for s in block]), np.stack([s.covariance_mm2 for s in block])
-    duplicate, predicted = np.stack([s.duplicate for s in block]), np.stack([s.predicted for s in block])
+    left_out = {name: np.stack([getattr(s, name) for s in block]) for name in LEFT_OUT}
     if chosen is not None:
         position = np.where(chosen[:, None, :, None], position, np.nan)
-        duplicate, predicted = duplicate & chosen[:, None], predicted & chosen[:, None]
+        left_out = {name: flagged & chosen[:, None] for name, flagged in left_out.items()}
     present: Bool = np.all(np.isfinite(position), axis=3)
     a, b = pairs.T
     seen_a, seen_b = present[:, a], present[:, b]
@@ -151,11 +158,12 @@ def _fit_block(
     some = ~seen_a.any(axis=2) | ~seen_b.any(axis=2)
     codes |= np.where(some & (count < LEAST_POINTS), BIT["segment-missing"], 0)
     codes |= np.where(~some & (count < LEAST_POINTS), BIT["too-few-markers"], 0)
-    codes |= np.where((duplicate[:, a] | duplicate[:, b]).any(axis=2), BIT["marker-duplicate"], 0)
-    codes |= np.where((predicted[:, a] | predicted[:, b]).any(axis=2), BIT["marker-predicted"], 0)
-    wanted = np.ones_like(present[:, 0]) if chosen is None else chosen
-    lost = (wanted[:, None] & ~common & ~(duplicate | predicted)[:, a] & ~(duplicate | predicted)[:, b]).any(axis=2)
-    codes |= np.where(lost & ~some, BIT["marker-missing"], 0)
+    lost = ~common if chosen is None else ~common & chosen[:, None]
+    for name, flagged in left_out.items():
+        either = flagged[:, a] | flagged[:, b]
+        codes |= np.where(either.any(axis=2), BIT[f"marker-{name}"], 0)
+        lost &= ~either
+    codes |= np.where(lost.any(axis=2) & ~some, BIT["marker-missing"], 0)
     fits.count[rows], fits.codes[rows] = count, codes
     order = np.argsort(~common, axis=2, kind="stable")
     for size in np.unique(count[count >= LEAST_POINTS]).tolist():

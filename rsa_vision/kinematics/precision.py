@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from rsa_vision.types import Float
 
@@ -57,6 +57,6 @@ def summarise(differences: Float) -> Precision:
         return Precision(0, *[np.nan] * 10)
     mean, sd = float(d.mean()), float(d.std(ddof=1)) if n > 1 else np.nan
     zero = float(np.sqrt((d**2).mean()))
-    reach = float(student.isf(0.025, n - 1)) * sd / np.sqrt(n) if n > 1 else np.nan
+    reach = float(stdtrit(n - 1, 0.975)) * sd / np.sqrt(n) if n > 1 else np.nan
     middle, low, high = float(np.median(d)), float(d.min()), float(d.max())
     return Precision(n, mean, sd, WITHIN_95 * sd, zero, zero / np.sqrt(2), middle, low, high, mean - reach, mean + reach)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from rsa_vision.kinematics.kinema import follow_up_pairs
-from rsa_vision.kinematics.motion_fits import DISTANCE_SIGMA, distance_changes
+from rsa_vision.kinematics.kinema import Columns, follow_up_pairs
+from rsa_vision.kinematics.motion_fits import DISTANCE_SIGMA, alike
 from rsa_vision.kinematics.series import Segment, Series
-from rsa_vision.types import Float
+from rsa_vision.types import Bool, Float, Int
+
+UM = 1000.0
 
 
-def rigidity(series: Sequence[Series], stable_mm: float) -> Iterator[dict[str, Any]]:
-    """Yield the sides and angles of every segment's polygon against the first and the preceding examination.
+def rigidity(series: Sequence[Series], stable_mm: float) -> Columns:
+    """Return the sides and angles of every segment's polygon against the first and the preceding examination.
 
     Parameters
     ----------
@@ -22,50 +24,84 @@ def rigidity(series: Sequence[Series], stable_mm: float) -> Iterator[dict[str, A
     stable_mm : float
         Change of a side beyond which, and beyond three standard deviations, it is ``changed``.
 
-    Yields
-    ------
-    dict
-        A row of ``rigidity.csv``: the side from ``marker`` to ``marker_next``, and the angle at ``marker``. The polygon joins the markers
-        that both examinations show, in numerical order.
+    Returns
+    -------
+    dict of str to ndarray
+        The columns of ``rigidity.csv``: the side from ``marker`` to ``marker_next``, and the angle at ``marker``. The polygon joins the
+        markers that both examinations show, in numerical order; two markers make one side and no angle.
     """
-    for one in series:
-        for segment in one.segments:
-            for a, b in follow_up_pairs(one):
-                key = {"subject": one.subject, "exam_from": one.exams[a], "exam_to": one.exams[b], "segment": segment.name}
-                yield from ({**key, **row} for row in _polygon(segment, a, b, stable_mm))
+    bodies = [(one, segment, follow_up_pairs(one)) for one in series for segment in one.segments]
+    keys = [(one.subject, one.exams[a], one.exams[b], segment.name) for one, segment, pairs in bodies for a, b in pairs]
+    lengths = [len(pairs) for *_, pairs in bodies]
+    first = np.cumsum([0, *lengths], dtype=np.int64)
+    size = max((len(segment.markers) for _, segment, _ in bodies), default=0)
+    all_polygons = _Polygons.empty(len(keys), size)
+    for pairs, members in alike([segment for _, segment, _ in bodies], [pairs for *_, pairs in bodies]):
+        rows = first[members][:, None] + np.arange(len(pairs))
+        _fill(all_polygons, [bodies[i][1] for i in members], np.array(pairs), rows)
+    p, real = all_polygons, all_polygons.corner
+    where = np.repeat(np.arange(len(keys)), real.sum(axis=1))
+    columns: Columns = {
+        name: np.array([key[k] for key in keys], object)[where] for k, name in enumerate(("subject", "exam_from", "exam_to", "segment"))
+    }
+    names = np.array([marker for _, segment, _ in bodies for marker in segment.markers], object)
+    begin = np.repeat(np.cumsum([0, *(len(segment.markers) for _, segment, _ in bodies)])[:-1], lengths)[where]
+    columns |= {"marker": names[begin + p.column[real]], "marker_next": names[begin + p.ahead[real]]}
+    side, angle, sd = p.side_mm[:, real], p.angle_deg[:, real], p.sd_change_mm[real]
+    columns |= {"side_from_mm": side[0], "side_to_mm": side[1], "side_change_um": UM * (side[1] - side[0]), "sd_side_change_um": UM * sd}
+    columns |= {"angle_from_deg": angle[0], "angle_to_deg": angle[1], "angle_change_deg": angle[1] - angle[0]}
+    columns["changed"] = np.abs(side[1] - side[0]) > np.fmax(stable_mm, DISTANCE_SIGMA * sd)
+    return columns
 
 
-def _polygon(segment: Segment, a: int, b: int, stable_mm: float) -> Iterator[dict[str, Any]]:
-    common = np.flatnonzero(segment.present[a] & segment.present[b])
-    if len(common) < 2:
-        return
-    points = segment.position_mm[[a, b]][:, common]
-    errors = segment.covariance_mm2[[a, b]][:, common]
-    change, sd = distance_changes(points[:1], points[1:], errors[:1], errors[1:])
-    known = np.isfinite(errors).all()
-    ahead = np.roll(np.arange(len(common)), -1)
-    sides = np.linalg.norm(points[:, ahead] - points, axis=2)
-    angles = _angles(points) if len(common) > 2 else np.full((2, len(common)), np.nan)
-    for k in range(len(common) if len(common) > 2 else 1):
-        error = float(sd[0, k, ahead[k]]) if known else np.nan
-        moved = abs(float(change[0, k, ahead[k]])) > max(stable_mm, DISTANCE_SIGMA * error if known else 0.0)
-        yield {
-            "marker": segment.markers[common[k]],
-            "marker_next": segment.markers[common[ahead[k]]],
-            "side_from_mm": sides[0, k],
-            "side_to_mm": sides[1, k],
-            "side_change_um": 1000 * (sides[1, k] - sides[0, k]),
-            "sd_side_change_um": 1000 * error,
-            "angle_from_deg": angles[0, k],
-            "angle_to_deg": angles[1, k],
-            "angle_change_deg": angles[1, k] - angles[0, k],
-            "changed": moved,
-        }
+@dataclass(frozen=True, slots=True, eq=False)
+class _Polygons:
+    """R polygons of up to n corners: ``corner`` says which places are used, ``column`` and ``ahead`` which markers a side joins."""
+
+    corner: Bool
+    column: Int
+    ahead: Int
+    side_mm: Float  # (2, R, n): before and after
+    angle_deg: Float  # (2, R, n)
+    sd_change_mm: Float  # NaN where covariances are not known
+
+    @classmethod
+    def empty(cls, count: int, size: int) -> _Polygons:
+        shape = (count, size)
+        numbers = (np.full((*lead, *shape), np.nan) for lead in ((2,), (2,), ()))
+        return cls(np.zeros(shape, bool), np.zeros(shape, np.int64), np.zeros(shape, np.int64), *numbers)
 
 
-def _angles(points: Float) -> Float:
-    """Return the angles, deg, at the corners of closed polygons, shape (k, n, 3) to (k, n)."""
-    ahead, behind = np.roll(points, -1, axis=1) - points, np.roll(points, 1, axis=1) - points
-    cross = np.linalg.norm(np.cross(ahead, behind), axis=2)
-    result: Float = np.degrees(np.arctan2(cross, (ahead * behind).sum(axis=2)))
+def _fill(polygons: _Polygons, block: Sequence[Segment], pairs: Int, rows: Int) -> None:
+    """Compute the polygons of segments with as many markers and the same pairs into `rows`, shape (segments, pairs)."""
+    position, covariance = np.stack([s.position_mm for s in block]), np.stack([s.covariance_mm2 for s in block])
+    present: Bool = np.all(np.isfinite(position), axis=3)
+    common = present[:, pairs[:, 0]] & present[:, pairs[:, 1]]
+    count = common.sum(axis=2)
+    order = np.argsort(~common, axis=2, kind="stable")
+    for size in np.unique(count[count >= 2]).tolist():
+        body, pair = np.nonzero(count == size)
+        column = order[body, pair, :size]
+        at = (body[:, None], pairs[pair].T[..., None], column)  # before and after, polygon, corner
+        points, errors = position[at], covariance[at]
+        row, corners = rows[body, pair], slice(size if size > 2 else 1)
+        towards = np.roll(points, -1, axis=2) - points
+        side = np.linalg.norm(towards, axis=3)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            unit = np.nan_to_num(towards / side[..., None])
+        variance = np.einsum("ekca,ekcab,ekcb->kc", unit, errors + np.roll(errors, -1, axis=2), unit)
+        known = np.isfinite(errors).all(axis=(0, 2, 3, 4))
+        polygons.corner[row, corners] = True
+        polygons.column[row, :size], polygons.ahead[row, :size] = column, np.roll(column, -1, axis=1)
+        polygons.side_mm[:, row, :size] = side
+        polygons.sd_change_mm[row, :size] = np.where(known[:, None], np.sqrt(np.maximum(variance, 0)), np.nan)
+        if size > 2:
+            polygons.angle_deg[:, row, :size] = _angles(towards)
+
+
+def _angles(towards: Float) -> Float:
+    """Return the angles, deg, at the corners of closed polygons with these sides, shape (..., c, 3) to (..., c)."""
+    behind = -np.roll(towards, 1, axis=-2)
+    cross = np.linalg.norm(np.cross(towards, behind), axis=-1)
+    result: Float = np.degrees(np.arctan2(cross, (towards * behind).sum(axis=-1)))
     return result

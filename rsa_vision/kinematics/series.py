@@ -11,12 +11,19 @@ from typing import Final
 
 import numpy as np
 
+from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, Int, Str, Table
 
 CENTURY: Final = 70  # two-figure years from here on are of the 20th century (Selvik's numbers of ten figures)
 DAY_S: Final = 86400.0
-DATED: Final = re.compile(r"(?P<date>\d{4}-?\d\d-?\d\d|\d{10}|\d{12})(?:[T ]?(?P<time>\d\d:?\d\d))?(?P<letter>[a-z]?)", re.IGNORECASE)
+DATED: Final = re.compile(
+    r"(?P<date>\d{4}(?P<mark>[-./]?)\d\d(?P=mark)\d\d|\d{10}|\d{12})(?:[T ]?(?P<time>\d\d:?\d\d)(?::\d\d(?:\.\d+)?)?)?(?P<letter>[a-z]?)",
+    re.IGNORECASE,
+)
+DAY_OR_MONTH_FIRST: Final = re.compile(r"\d{1,2}([-./])\d{1,2}\1(\d{4}|\d{2})(\D.*)?")
 REPEAT: Final = re.compile(r"(?P<first>.+)(?P<letter>[b-z])", re.IGNORECASE)
+
+DOUBTFUL: Final = MarkerFlag.LOOSE | MarkerFlag.AMBIGUOUS  # the marker has moved in its bone, or it may be another one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,8 +37,8 @@ class MarkerTable(Table):
         NaN where not determined.
     covariance_mm2 : ndarray of shape (n, 3, 3)
         NaN where not known.
-    predicted : ndarray of bool, shape (n,)
-        Placed by the known segment, not by rays.
+    flags : ndarray of int, shape (n,)
+        As of :class:`rsa_vision.flags.MarkerFlag`; predicted, loose and ambiguous markers are not used.
     """
 
     subject: Str
@@ -40,7 +47,7 @@ class MarkerTable(Table):
     marker: Str
     position_mm: Float
     covariance_mm2: Float
-    predicted: Bool
+    flags: Int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,9 +60,10 @@ class Segment:
     markers : tuple of str
         All n that any examination has, in order.
     position_mm : ndarray of shape (E, n, 3)
-        NaN where a marker is missing, stands twice or was only predicted.
+        NaN where a marker is missing, stands twice, or must not be used.
     covariance_mm2 : ndarray of shape (E, n, 3, 3)
-    duplicate, predicted : ndarray of bool, shape (E, n)
+    duplicate, predicted, doubtful : ndarray of bool, shape (E, n)
+        Why not: twice in an examination; placed by the known segment, not by rays; flagged loose or ambiguous.
     """
 
     name: str
@@ -64,6 +72,7 @@ class Segment:
     covariance_mm2: Float
     duplicate: Bool
     predicted: Bool
+    doubtful: Bool
 
     @property
     def present(self) -> Bool:
@@ -111,8 +120,8 @@ def exam_time(exam: str) -> datetime | None:
     Parameters
     ----------
     exam : str
-        ``yyyymmdd``, ``yyyymmddhhmm``, ``yyyy-mm-dd`` (with or without a time ``hh:mm``), or Selvik's ten figures ``yymmddhhmm``; a letter
-        after it marks a repeat.
+        ``yyyymmdd``, ``yyyymmddhhmm``, ``yyyy-mm-dd`` (also with ``.`` or ``/``, with or without a time ``hh:mm``), or Selvik's ten
+        figures ``yymmddhhmm``; a letter after it marks a repeat.
 
     Returns
     -------
@@ -129,6 +138,11 @@ def exam_time(exam: str) -> datetime | None:
         return datetime.strptime(figures.ljust(12, "0"), "%Y%m%d%H%M")
     except ValueError:
         return None
+
+
+def order_is_unclear(exam: str) -> bool:
+    """Return whether the name of an examination is a date with the day or the month first: sorting does not bring it in order of time."""
+    return DAY_OR_MONTH_FIRST.fullmatch(exam) is not None
 
 
 def make_series(table: MarkerTable, status: Mapping[tuple[str, str], str] | None = None) -> tuple[Series, ...]:
@@ -198,11 +212,12 @@ def _segment(table: MarkerTable, name: str, rows: Sequence[int], exams: Sequence
     count = np.zeros((len(exams), len(markers)), np.int64)
     np.add.at(count, (e, m), 1)
     duplicate = count > 1
-    predicted = np.zeros_like(duplicate)
-    predicted[e, m] = table.predicted[at]
+    flags = np.zeros_like(count)
+    flags[e, m] = table.flags[at]
+    predicted, doubtful = flags & MarkerFlag.PREDICTED > 0, flags & DOUBTFUL > 0
     position = np.full((*duplicate.shape, 3), np.nan)
     covariance = np.full((*duplicate.shape, 3, 3), np.nan)
     position[e, m], covariance[e, m] = table.position_mm[at], table.covariance_mm2[at]
-    unusable = duplicate | predicted | ~np.isfinite(position).all(axis=2)
+    unusable = duplicate | predicted | doubtful | ~np.isfinite(position).all(axis=2)
     position[unusable] = np.nan
-    return Segment(name, markers, position, covariance, duplicate, predicted)
+    return Segment(name, markers, position, covariance, duplicate, predicted, doubtful)

@@ -115,6 +115,20 @@ def test_names_by_segments_are_the_true_ones_in_every_examination(films: Path, h
     assert "segments.csv" in run
 
 
+def test_films_of_known_segments_end_with_their_true_motion(films: Path, hide: Any, tmp_path: Path) -> None:
+    hide()
+    assert run_app(["measure", str(films), "-o", str(tmp_path / "out"), "--segments", str(films / "truth" / "segments.csv")]) == 0
+    assert run_app(["motion", str(films / "truth" / "markers.csv"), "-o", str(tmp_path / "truth")]) == 0
+    found, true = (read(tmp_path / name / "motion.csv").filter(pl.col("reference") == "bone") for name in ("out", "truth"))
+    assert found["status"].to_list() == ["ok"] * 3
+    names = [f"{kind}{axis}_{unit}" for kind, unit in (("r", "deg"), ("t", "mm")) for axis in "xyz"]
+    off = (found.select(names).to_numpy() - true.select(names).to_numpy()) / found.select(f"sd_{name}" for name in names).to_numpy()
+    assert np.abs(off).max() < 4.5
+    assert 0.3 < np.sqrt((off**2).mean()) < 1.6  # 12 of these 18 are independent
+    assert np.allclose(true.filter(pl.col("exam_from") == int(FIRST))[0].select("rx_deg", "ry_deg", "rz_deg"), [1.0, -0.6, 0.4], atol=0.01)
+    assert (tmp_path / "out" / "report.html").read_text().count("over time") == 7
+
+
 def test_names_without_segments_stay_those_of_the_first_examination(films: Path, hide: Any, tmp_path: Path) -> None:
     hide((FIRST, 1, "bone/2"), (FIRST, 2, "bone/2"), (SECOND, 1, "implant/1"), (SECOND, 2, "implant/1"))
     assert run_app(["measure", str(films), "-o", str(tmp_path)]) == 1

@@ -62,6 +62,18 @@ def test_motion_writes_the_published_columns_beside_its_input_or_into_out(marker
     assert not set(left["frame"]) & set(found["frame"])
 
 
+def test_markers_that_are_flagged_are_read_as_such(markers: Path) -> None:
+    table = pl.read_csv(markers, infer_schema=False)
+    third = (pl.col("subject") == "S001") & (pl.col("segment") == "stem") & (pl.col("marker") == "3") & (pl.col("exam") == "202602010900")
+    for flag, reason in (("predicted", "predicted"), ("overlap;loose", "doubtful"), ("ambiguous", "doubtful")):
+        flags = pl.when(third).then(pl.lit(flag)).otherwise(pl.lit(""))
+        table.with_columns(flags=flags).write_csv(markers)
+        found = rsa_vision.motion(markers).table.filter(pl.col("reasons").fill_null("").str.contains(f"marker-{reason}"))
+        assert set(found["n_markers"]) == {5}, flag
+        assert set(found["subject"]) == {"S001"}
+        assert set(found["status"]) == {"ok"}
+
+
 def test_rigidity_has_every_side_of_the_closed_polygon(markers: Path) -> None:
     rsa_vision.motion(markers)
     sides = read(markers.with_name("rigidity.csv"))
@@ -102,8 +114,49 @@ def test_tables_of_other_programs_are_read_with_their_separator(markers: Path, s
 
 
 @pytest.mark.parametrize(
+    "header",
+    [
+        "Patient,Examination,Body,Point,X,Y,Z,SD X,SD Y,SD Z",
+        "patient id;exam date;rigid body;landmark;X [mm];Y [mm];Z [mm];std_x;std_y;std_z",
+        "Case\tVisit\tComponent\tBead\tx (mm)\ty (mm)\tz (mm)\tsigma x [mm]\tsigma y [mm]\tsigma z [mm]",
+    ],
+)
+def test_columns_are_recognised_by_the_names_that_other_programs_give_them(header: str, markers: Path) -> None:
+    separator = max(",;\t", key=header.count)
+    _, *lines = markers.read_text().splitlines()
+    other = markers.with_name("other.csv")
+    other.write_text("\n".join([header, *(line.replace(",", separator) for line in lines)]))
+    found, expected = rsa_vision.motion(other).table, rsa_vision.motion(markers).table
+    assert found.equals(expected)
+
+
+def test_a_marker_can_tell_its_segment(markers: Path) -> None:
+    expected = rsa_vision.motion(markers).table
+    joined = pl.read_csv(markers, infer_schema=False).with_columns(point=pl.col("segment") + "/" + pl.col("marker"))
+    joined.drop("segment", "marker").write_csv(markers)
+    assert rsa_vision.motion(markers).table.equals(expected)
+
+
+def test_dates_of_unclear_order_are_to_be_reviewed_and_others_have_their_days(markers: Path) -> None:
+    table = pl.read_csv(markers, infer_schema=False)
+    months = table["exam"].unique().sort().to_list()
+    table.with_columns(pl.col("exam").replace({name: f"{k}/4/2026" for k, name in enumerate(months, 1)})).write_csv(markers)
+    found = rsa_vision.motion(markers).table
+    assert found["reasons"].str.contains("exam-order-unclear").all()
+    assert set(found["status"]) == {"review"}
+    table.with_columns(pl.col("exam").replace({name: f"2026/04/1{k} 09:30:00" for k, name in enumerate(months)})).write_csv(markers)
+    found = rsa_vision.motion(markers).table
+    assert set(found["status"]) == {"ok"}
+    assert set(found["days"]) == {1.0, 2.0}
+
+
+@pytest.mark.parametrize(
     ("content", "said"),
     [
+        ("exam,segment,marker,x [cm],y [cm],z [cm]\n1,a,1,0,0,0\n", "x [cm] is in cm; give mm, in a column x_mm"),
+        ("exam,segment,marker,x,y,z\n1,a,1,0.01,0.2,0\n1,a,2,0.01,0,0.1\n", "x, y, z do not say their unit and span 0.2; give mm"),
+        ("exam,segment,point,bead,x,y,z\n1,a,1,0,0,0\n", "point and bead may both be the column marker; rename the right one"),
+        ("exam;segment;marker;x;y;z\n1;a;1;0,5;1,234;1.5\n", "y_mm is '1,234', not a number"),
         ("", "not a readable CSV"),
         ("exam,segment,marker,x_mm,y_mm\n1,a,1,0,0\n", "missing columns: z_mm"),
         ("exam,segment,marker,x_mm,y_mm,z_mm\n", "no marker in it"),
@@ -196,6 +249,7 @@ def test_growth_between_two_times_has_stated_errors_that_are_true(markers: Path)
 
 def test_ten_thousand_motions_take_a_second(tmp_path: Path) -> None:
     from rsa_vision.kinematics.kinema import motions
+    from rsa_vision.kinematics.rigidity import rigidity
     from rsa_vision.kinematics.series import make_series
     from rsa_vision.settings import Limits, Motion
 
@@ -204,7 +258,9 @@ def test_ten_thousand_motions_take_a_second(tmp_path: Path) -> None:
     series = make_series(table([one] * 10_000, rng, np.eye(3) * 1e-4))
     started = time.process_time()
     found = motions(series, Motion(), Limits(condition_number=1e4))
+    sides = rigidity(series, 0.35)
     assert time.process_time() - started < 2.0  # 0.7 s where nothing else runs
+    assert len(sides["marker"]) == 50_000
     assert len(found["status"]) == 10_000
 
 
@@ -237,6 +293,37 @@ def test_a_run_with_known_segments_ends_with_motion_in_its_report(markers: Path,
     assert "a &lt;stem&gt;" in page
     assert "36 motions: 36 ok" in page
     assert "set posture in [report]" in page
+    assert "Groups" in page
+    assert "open circles" not in page
+    loosened = pl.read_csv(markers, infer_schema=False)
+    third = (pl.col("subject") == "S001") & (pl.col("segment") == "stem") & (pl.col("marker") == "3") & (pl.col("exam") == "202602010900")
+    loosened = loosened.with_columns(x_mm=pl.when(third).then(pl.lit("500")).otherwise("x_mm")).filter(pl.col("subject") == "S001")
+    loosened.write_csv(out / "markers.csv")
+    api.write_motion(out, study)
+    frame([], SCHEMAS["markers"]).write_csv(out / "markers.csv")
+    page = api.report(out).read_text()
+    assert "open circles are motions to be reviewed" in page
+    assert "Groups" not in page  # of one subject
+
+
+def test_continuous_migration_is_told_of_motions_that_are_ok_alone(tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    exams = {"202601010900": "20240101", "202602010900": "20250101", "202603010900": "20260101"}
+    bodies = subject(rng, exams=3, segments=("bone", "stem"), markers=5, angle_deg=0, shift_mm=0)
+    bodies.shift[1, "stem"][1], bodies.shift[2, "stem"][1] = -0.5, -1.0
+    path = write(tmp_path / "markers.csv", [bodies], rng, exams)
+
+    def told() -> dict[tuple[str, str], bool | None]:
+        table = rsa_vision.motion(path, reference="bone").table
+        rows = table.filter((pl.col("segment") == "stem") & (pl.col("reference") == "bone"))
+        return {(row["exam_from"], row["exam_to"]): row["continuous"] for row in rows.to_dicts()}
+
+    late = ("20250101", "20260101")
+    assert told() == {("20240101", "20250101"): None, ("20240101", "20260101"): None, late: True}
+    table = pl.read_csv(path, infer_schema=False)
+    first = (pl.col("segment") == "stem") & (pl.col("marker") == "1") & (pl.col("exam") == "20260101")
+    table.with_columns(y_mm=pl.when(first).then(pl.lit("99")).otherwise("y_mm")).write_csv(path)
+    assert told()[late] is None
 
 
 def test_a_table_with_a_row_for_each_frame_is_read_as_xmalab_writes_it(markers: Path) -> None:

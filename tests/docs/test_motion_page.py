@@ -17,7 +17,7 @@ from .test_pages import codes, page, rows, section, toml_blocks
 
 
 def test_the_worked_example_gives_what_the_page_says(tmp_path: Path) -> None:
-    text = section("motion.md", "A worked example")
+    text = section("motion.md", "A table and its motion")
     (table,) = re.findall(r"```text\n(.*?)```", text, re.DOTALL)
     (tmp_path / "markers.csv").write_text(table)
     found = api.motion(tmp_path / "markers.csv", reference="bone")

@@ -64,7 +64,7 @@ def table(subjects: list[Subject], rng: np.random.Generator | None = None, covar
     own = np.full((3, 3), np.nan) if covariance is None else covariance
     texts = np.array(rows)
     return MarkerTable(
-        texts[:, 0], texts[:, 1], texts[:, 2], texts[:, 3], position, np.tile(own, (len(rows), 1, 1)), np.zeros(len(rows), bool)
+        texts[:, 0], texts[:, 1], texts[:, 2], texts[:, 3], position, np.tile(own, (len(rows), 1, 1)), np.zeros(len(rows), np.int64)
     )
 
 

@@ -8,6 +8,7 @@ from pytransform3d import rotations as pr
 from pytransform3d import transformations as pt
 from scipy.spatial.transform import Rotation
 
+from rsa_vision.flags import MarkerFlag
 from rsa_vision.kinematics.series import MarkerTable
 from rsa_vision.settings import Limits
 
@@ -150,7 +151,9 @@ def two_segments(markers: int = 4) -> tuple[MarkerTable, np.ndarray]:
         (lambda t, at: t.rows(~np.isin(np.arange(len(t)), at)), "failed", "segment-missing", False),
         (lambda t, at: changed(t, at[:2], position_mm=np.nan), "failed", "too-few-markers", False),
         (lambda t, at: changed(t, at[:1], position_mm=np.nan), "ok", "marker-missing", True),
-        (lambda t, at: changed(t, at[:1], predicted=True), "ok", "marker-predicted", True),
+        (lambda t, at: changed(t, at[:1], flags=MarkerFlag.PREDICTED), "ok", "marker-predicted", True),
+        (lambda t, at: changed(t, at[:1], flags=MarkerFlag.LOOSE, position_mm=t.position_mm[at[0]] + 2), "ok", "marker-doubtful", True),
+        (lambda t, at: changed(t, at[:1], flags=MarkerFlag.AMBIGUOUS), "ok", "marker-doubtful", True),
         (lambda t, at: changed(t, at, position_mm=t.position_mm[at] * [-1, 1, 1]), "failed", "mirrored", False),
         (lambda t, at: changed(t, at[:1], marker="2"), "failed", "too-few-markers", False),
         (lambda t, at: changed(t, at[:1], position_mm=t.position_mm[at[0]] + 2), "review", "marker-unstable", True),
