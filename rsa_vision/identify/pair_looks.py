@@ -23,7 +23,7 @@ KIND: Final = np.array([0.03, 0.05])  # sd of sizes and contrasts within a kind 
 WIDE: Final = np.array([0.7, 0.7])  # sd of sizes and contrasts of any images
 HIDDEN: Final = (0.5, 10.0)  # markers that one focus does not show, of all: a guess of one in twenty, which weighs like ten markers
 UNKNOWN: Final = 2.0  # images that look like anything, which are presumed beside those at hand
-UNLIKE: Final = (0.1, 2.0)  # pairs that do not look like one, of all: a guess of one in twenty
+UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one image, a film's toe), of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
 FAINT: Final = 1e-3  # pairs less probable than that teach nothing
 
