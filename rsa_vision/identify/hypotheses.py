@@ -19,7 +19,7 @@ from rsa_vision.types import Float, Int
 LARGEST_GAP_MM: Final = 45.0
 FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than allowed, to say `focus-far` rather than `not found`
 WEIGHED: Final = 10  # hypotheses that are fitted
-MELTED: Final = 0.5  # of the control points of a focus may be hidden, or melted into images of another focus
+COVERED: Final = 0.4  # of the control points of a focus may have no image: a third hidden, and one behind a screw or a letter
 TILTED: Final = 2.0  # standard deviations of the tilt that are allowed for
 OVERLAP: Final = 0.5  # of the marks must lie on others after a move that could be mistaken
 
@@ -55,7 +55,7 @@ def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, missing: float,
             [
                 (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))
                 for A, b, _ in grids[key]
-                for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach, missing)
+                for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach, max(missing, COVERED))
             ]
         )
     # an image that two foci claim counts once: otherwise the marks of one focus would do for both
