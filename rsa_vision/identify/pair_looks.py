@@ -95,7 +95,7 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
         like = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
         if known_a[e] and known_b[e]:
             wider = spread * np.sqrt(1 + 1 / n)
-            like += float((log_student((first[e] - second[e] - middle) / wider, n) - np.log(wider)).sum())
+            like += float((log_student((first[e] - second[e] - middle) / wider, min(n, 4.0)) - np.log(wider)).sum())
         result[e] = np.logaddexp(np.log1p(-unlike) + like, np.log(unlike))
     return result
 
