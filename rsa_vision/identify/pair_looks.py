@@ -150,12 +150,13 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     presumed = hidden * 2 * pairs
     total = float(single.sum()) + presumed + UNKNOWN
     for ray in np.flatnonzero(np.isfinite(looks.of_ray).all(axis=1)):
-        value, w = looks.of_ray[ray], np.where(looks.image[one[known]] != looks.image[ray], single[known], 0.0)
+        others = looks.image[one[known]] != looks.image[ray]
+        value, w, of_others = looks.of_ray[ray], np.where(others, single[known], 0.0), np.where(others, of_pairs, 0.0)
         parts = [np.log(UNKNOWN) + broad(value)]
         if w.sum() > 0:
             parts.append(np.log(w.sum()) + log_kernels(value, sample, w, KIND, float(w.sum())))
-        # markers look alike: kernels no wider than they must be, lest two hidden ones pass for a pair by their likeness
-        parts.append(np.log(presumed) + _log_density(value, sample, of_pairs, KIND, 2 * pairs))
+        if of_others.sum() > 0:
+            parts.append(np.log(presumed) + log_kernels(value, sample, of_others, KIND, 2 * pairs))
         density[ray] = np.logaddexp.reduce(parts) - np.log(total)
     return Alone(density, hidden)
 
