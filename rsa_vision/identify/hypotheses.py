@@ -135,13 +135,23 @@ def moved_by_a_mark(scene: Scene, parameters: Float, limits: Limits) -> list[Flo
     return found
 
 
+def largest_overlap(scene: Scene) -> float:
+    """Return the largest part of a film's marks that a grid moved by a row or column could name, all marks being there."""
+    named = 0.0
+    for k in range(len(scene.foci)):
+        for fiducial in (True, False):
+            marks = scene.xyz_mm[scene.own & (scene.fiducial == fiducial) & (scene.focus == k)]
+            named += len(marks) * max((_landed(marks, move) for move in _moves(marks)), default=OVERLAP)
+    return named / int(scene.own.sum())
+
+
 def _moves(marks: Float) -> list[Float]:
     """Return the shifts, level with the plane, that put more than half of the marks onto others."""
     moves = (marks[None] - marks[:, None]).reshape(-1, 3)
     moves = np.unique(np.round(moves[(np.abs(moves[:, :2]).max(axis=1) > 1) & (np.abs(moves[:, 2]) < 1)], 3), axis=0)
-    found = []
-    for move in moves:
-        landed = np.linalg.norm(marks[:, None] + move - marks[None], axis=2).min(axis=1) < 2.0
-        if landed.mean() > OVERLAP:
-            found.append(np.array([move[0], move[1], 0.0]))
-    return found
+    return [np.array([move[0], move[1], 0.0]) for move in moves if _landed(marks, move) > OVERLAP]
+
+
+def _landed(marks: Float, move: Float) -> float:
+    """Return the part of the marks that a shift puts onto others."""
+    return float((np.linalg.norm(marks[:, None] + move - marks[None], axis=2).min(axis=1) < 2.0).mean())
