@@ -12,21 +12,17 @@ from rsa_vision.cages import Cage
 from rsa_vision.cameras import Camera
 from rsa_vision.detect import detect_markers
 from rsa_vision.errors import CalibrationError, RsaError
-from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.camera import camera_rays
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.cage import CageIdentification, identify_cage
 from rsa_vision.identify.crossings import Region, cage_region
 from rsa_vision.identify.pairs import Pairing, pair_rays
 from rsa_vision.images import require_pitch
-from rsa_vision.readings import FilmReading, Readings, candidates, joined_rays, lonely_images, name_marks, name_objects
+from rsa_vision.readings import LOOKS_DOUBTFUL, FilmReading, Readings, candidates, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Study
 from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
 from rsa_vision.xray import rays_of, reconstruct, reconstruct_calibrated, solve_focus
-
-LOOKS_DOUBTFUL = int(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)
-"""Images whose size and contrast say little of their markers."""
 
 ExposedFilm = tuple[Film, int | None]
 """A film and the focus that it belongs to, None for all foci."""

@@ -12,11 +12,14 @@ import numpy as np
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.rays import RayBundle, intersect_lines
 from rsa_vision.identify.cage import CageIdentification
+from rsa_vision.identify.lone import chance_of_marker
 from rsa_vision.identify.pairs import Pairing
 from rsa_vision.types import Bool, Float, ImagePoints, Int, MarkerImages
 from rsa_vision.verdict import Finding
 
-LOOKALIKE: Final = 1.35  # images of equal balls differ in radius by the magnification alone, at most by this factor
+MAY_BE_MARKER: Final = 0.1  # probability from which a single image is one for a person to look at
+LOOKS_DOUBTFUL: Final = int(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)
+"""Images whose size and contrast say little of their markers."""
 OBJECT_SHAPE: Final = "ball"
 
 
@@ -162,15 +165,19 @@ def name_objects(named: Readings, table: Readings, bundle: RayBundle, pairing: P
 
 
 def lonely_images(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[Finding]:
-    """Find single images that look like those of markers: a marker that the other focus does not show, or hidden there."""
-    paired = np.array([bundle.image[ray] for group in pairing.groups for ray in group], int)
-    if not len(paired) or not len(pairing.unmatched):
-        return []
-    size, contrast = table.radius_px[paired], table.contrast[paired]
-    alone = pairing.unmatched
-    like = (table.radius_px[alone] > size.min() / LOOKALIKE) & (table.radius_px[alone] < size.max() * LOOKALIKE)
-    like &= (table.contrast[alone] > contrast.min() / LOOKALIKE) & (table.contrast[alone] < contrast.max() * LOOKALIKE)
-    return [("marker-one-view", _where(table, int(row))) for row in alone[like]]
+    """Find single images that may be markers that the other focus does not show, or hidden there."""
+    paired = np.zeros(len(table.points), bool)
+    paired[[bundle.image[ray] for group in pairing.groups for ray in group]] = True
+    with np.errstate(invalid="ignore", divide="ignore"):
+        look = np.log(np.column_stack([table.radius_px, table.contrast]))
+    doubtful = (table.points.flags & LOOKS_DOUBTFUL) != 0
+    found: list[Finding] = []
+    for number, film in enumerate(table.films):
+        here = np.flatnonzero(paired & (table.points.film == number))
+        here = np.concatenate([here, pairing.unmatched[table.points.film[pairing.unmatched] == number]])
+        chance = chance_of_marker(look[here], table.points.position_px[here], doubtful[here], paired[here], film.shape)
+        found += [("marker-one-view", _where(table, int(row))) for row in here[(chance > MAY_BE_MARKER) & ~paired[here]]]
+    return found
 
 
 def _where(table: Readings, row: int) -> str:

@@ -17,13 +17,13 @@ from rsa_vision.identify.appearance import FilmImages, film_images, on_bodies
 from rsa_vision.identify.checks import are_different, far_penalty, impossible_stretch, what_contradicts, what_is_missing
 from rsa_vision.identify.doubts import doubtful_marks, drop_gross_errors, without
 from rsa_vision.identify.film_model import FILM, Scene, build_scene, plane_from_film, project
-from rsa_vision.identify.hypotheses import find_hypotheses, moved_by_a_mark
+from rsa_vision.identify.hypotheses import find_hypotheses, largest_overlap, moved_by_a_mark
 from rsa_vision.identify.naming import Naming, melted_images, name_marks
 from rsa_vision.settings import Limits
 from rsa_vision.types import Bool, Float, Int, MarkerImages
 
 TURN_DEG: Final = {"upright": 46.0, "mirrored": 46.0, "any": 180.0}  # largest angle between film and plane
-COMPLETE: Final = 0.85  # of the marks named: no grid moved by a row or column could do that
+COMPLETE: Final = 0.85  # of the marks named, or more where a row is long: no grid moved by a row or column could do that
 MISSING: Final = 1 / 3  # of the marks of a focus may have no image
 MISREAD: Final = 0.45  # or none of the mark's shape
 SAME_MM: Final = 1.5  # hypotheses that show every mark as near as this come to the same naming
@@ -185,11 +185,12 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
     answer = _Answer(film.cage, film.images, usable, scene, film.mm_from_px(reading))
     namings: list[Naming] = []
     result = answer.failed("too few images")
+    enough_for_all = max(COMPLETE, largest_overlap(scene))
     for among, missing in ((np.isin(usable, likely), MISREAD if misread else MISSING), (np.ones(len(usable), bool), MISSING)):
         if among.sum() < LEAST_IMAGES:
             continue
         _weigh(namings, scene, seen, log_room, find_hypotheses(scene, seen.xy_mm[among], reading.turn_deg, missing, limits))
-        complete = any((naming.image[scene.own] >= 0).mean() > COMPLETE for naming in namings)
+        complete = any((naming.image[scene.own] >= 0).mean() > enough_for_all for naming in namings)
         if namings and not complete:
             best = max(namings, key=lambda n: n.log_evidence)
             _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters, limits))

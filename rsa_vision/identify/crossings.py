@@ -14,6 +14,7 @@ from rsa_vision.geometry.rays import RayBundle, cross
 from rsa_vision.types import Bool, Float, Int
 
 WINDOWS_MM: Final = (3.0, 10.0)  # in which unrelated crossings are counted
+SPREAD_OF_MEDIAN: Final = 3.4  # breadth of a uniform distribution over the median distance of two of it, 1 / (1 - sqrt(1/2))
 SLACKS_MM: Final = (0.0, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3)  # systematic error of rays beyond their covariance, tried in turn
 FRACTIONS: Final = (0.03, 0.1, 0.2, 0.4, 0.7, 0.9)  # of rays that have a partner, tried likewise
 SLACK_EVIDENCE: Final = 5.0  # log likelihood by which a slack must be better than none
@@ -69,11 +70,12 @@ def in_front(bundle: RayBundle) -> Region:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbours:
-    """Rays of two foci (rising), and which of them pass each other at a possible place within each window."""
+    """Rays of two foci (rising), which of them pass each other at a possible place within each window, and the breadth they all fill."""
 
     first: Int
     second: Int
     close: tuple[Bool, ...]
+    breadth_mm: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,17 +116,20 @@ class Crossings:
     def among(self, neighbours: tuple[Neighbours, ...], weight: Float) -> Crossings:
         """Return them with the density of crossings with rays that count by a weight: their probability to be there without a partner.
 
-        The largest of what is met around either ray in either window counts, and half a crossing more, as few are counted.
+        The largest of what is met around either ray in either window counts, but no less than everywhere (all of them, and half a ray more,
+        on the breadth that the rays fill). As few are counted in a window, half a ray is added to it, with the room that it has elsewhere.
         """
         density = np.zeros(len(self))
         for some in neighbours:
             mine = np.isin(self.a, some.first) & np.isin(self.b, some.second)
             i, j = np.searchsorted(some.first, self.a[mine]), np.searchsorted(some.second, self.b[mine])
             of_a, of_b = weight[some.first], weight[some.second]
+            everywhere = (max(float(of_a.sum()), float(of_b.sum())) + 0.5) / some.breadth_mm
+            density[mine] = everywhere
             for window, close in zip(WINDOWS_MM, some.close, strict=True):
                 around_a, around_b = close @ of_b, of_a @ close
                 others = np.maximum(around_a[i] - of_b[j], around_b[j] - of_a[i])
-                density[mine] = np.maximum(density[mine], (others.clip(0) + 0.5) / (2 * window))
+                density[mine] = np.maximum(density[mine], (others.clip(0) + 0.5) / (2 * window + 0.5 / everywhere))
         return replace(self, log_density=np.log(density))
 
     def log_ratio(self) -> Float:
@@ -166,7 +171,9 @@ def find_crossings(bundle: RayBundle, region: Region | None) -> tuple[Crossings,
             possible = np.isfinite(distance) & (sigma > 0) & (bundle.image[first][:, None] != bundle.image[second][None])
             possible &= inside(np.nan_to_num(points))
             close = tuple(possible & (distance < window) for window in WINDOWS_MM)
-        neighbours.append(Neighbours(first, second, close))
+        with np.errstate(invalid="ignore"):
+            median = float(np.median(distance[np.isfinite(distance)])) if np.isfinite(distance).any() else 0.0
+        neighbours.append(Neighbours(first, second, close, max(SPREAD_OF_MEDIAN * median, 2 * WINDOWS_MM[-1])))
         i, j = np.nonzero(close[0])
         a, b, at = first[i], second[j], points[i, j]
         grown_a = np.log(np.linalg.norm(at - bundle.origin_mm[a], axis=1) / length[a])

@@ -19,7 +19,7 @@ from rsa_vision.types import Float, Int
 LARGEST_GAP_MM: Final = 45.0
 FOCUS_REACH: Final = 1.4  # foci are searched this many times further away than allowed, to say `focus-far` rather than `not found`
 WEIGHED: Final = 10  # hypotheses that are fitted
-MELTED: Final = 0.5  # of the control points of a focus may be hidden, or melted into images of another focus
+COVERED: Final = 0.4  # of the control points of a focus may have no image: a third hidden, and one behind a screw or a letter
 TILTED: Final = 2.0  # standard deviations of the tilt that are allowed for
 OVERLAP: Final = 0.5  # of the marks must lie on others after a move that could be mistaken
 
@@ -55,7 +55,7 @@ def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, missing: float,
             [
                 (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))
                 for A, b, _ in grids[key]
-                for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach, missing)
+                for focus, _ in find_foci((xy_mm - b) @ np.linalg.inv(A).T, controls, scene.nominal_mm[k], reach, max(missing, COVERED))
             ]
         )
     # an image that two foci claim counts once: otherwise the marks of one focus would do for both
@@ -135,13 +135,23 @@ def moved_by_a_mark(scene: Scene, parameters: Float, limits: Limits) -> list[Flo
     return found
 
 
+def largest_overlap(scene: Scene) -> float:
+    """Return the largest part of a film's marks that a grid moved by a row or column could name, all marks being there."""
+    named = 0.0
+    for k in range(len(scene.foci)):
+        for fiducial in (True, False):
+            marks = scene.xyz_mm[scene.own & (scene.fiducial == fiducial) & (scene.focus == k)]
+            named += len(marks) * max((_landed(marks, move) for move in _moves(marks)), default=OVERLAP)
+    return named / int(scene.own.sum())
+
+
 def _moves(marks: Float) -> list[Float]:
     """Return the shifts, level with the plane, that put more than half of the marks onto others."""
     moves = (marks[None] - marks[:, None]).reshape(-1, 3)
     moves = np.unique(np.round(moves[(np.abs(moves[:, :2]).max(axis=1) > 1) & (np.abs(moves[:, 2]) < 1)], 3), axis=0)
-    found = []
-    for move in moves:
-        landed = np.linalg.norm(marks[:, None] + move - marks[None], axis=2).min(axis=1) < 2.0
-        if landed.mean() > OVERLAP:
-            found.append(np.array([move[0], move[1], 0.0]))
-    return found
+    return [np.array([move[0], move[1], 0.0]) for move in moves if _landed(marks, move) > OVERLAP]
+
+
+def _landed(marks: Float, move: Float) -> float:
+    """Return the part of the marks that a shift puts onto others."""
+    return float((np.linalg.norm(marks[:, None] + move - marks[None], axis=2).min(axis=1) < 2.0).mean())

@@ -23,7 +23,7 @@ KIND: Final = np.array([0.03, 0.05])  # sd of sizes and contrasts within a kind 
 WIDE: Final = np.array([0.7, 0.7])  # sd of sizes and contrasts of any images
 HIDDEN: Final = (0.5, 10.0)  # markers that one focus does not show, of all: a guess of one in twenty, which weighs like ten markers
 UNKNOWN: Final = 2.0  # images that look like anything, which are presumed beside those at hand
-UNLIKE: Final = (0.1, 2.0)  # pairs that do not look like one, of all: a guess of one in twenty
+UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one image, a film's toe), of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
 FAINT: Final = 1e-3  # pairs less probable than that teach nothing
 
@@ -91,11 +91,11 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
         spread = np.maximum(1.4826 * _weighted_median(deviation, weight), LEAST)
         spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL**2) / (n + USUAL_COUNT))
         unlike = (UNLIKE[0] + weight[(deviation > FAR * spread).any(axis=1)].sum()) / (UNLIKE[1] + n)
-        marker = _log_kernels(mean[e], mean[free], weight, np.hypot(KIND, spread / 2), n)
+        marker = log_kernels(mean[e], mean[free], weight, np.hypot(KIND, spread / 2), n)
         like = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
         if known_a[e] and known_b[e]:
             wider = spread * np.sqrt(1 + 1 / n)
-            like += float((_log_student((first[e] - second[e] - middle) / wider, n) - np.log(wider)).sum())
+            like += float((log_student((first[e] - second[e] - middle) / wider, min(n, 4.0)) - np.log(wider)).sum())
         result[e] = np.logaddexp(np.log1p(-unlike) + like, np.log(unlike))
     return result
 
@@ -139,23 +139,24 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     middle = _weighted_median(sample, np.ones(len(sample)))
 
     def broad(value: Float) -> Float:
-        result: Float = (_log_student((value - middle) / WIDE, 3.0) - np.log(WIDE)).sum(axis=-1)
+        result: Float = (log_student((value - middle) / WIDE, 3.0) - np.log(WIDE)).sum(axis=-1)
         return result
 
     of_pairs = np.maximum(paired[one[known]], 1e-9)
-    alike = np.array([_log_kernels(value, sample, of_pairs, KIND, 2 * pairs) for value in sample])
+    alike = np.array([log_kernels(value, sample, of_pairs, KIND, 2 * pairs) for value in sample])
     marker = np.ones(len(one))
     marker[known] = 1 / (1 + np.exp(np.clip(broad(sample) - alike, -50, 50)))
     hidden = _hidden(float(single @ marker), pairs)
     presumed = hidden * 2 * pairs
     total = float(single.sum()) + presumed + UNKNOWN
     for ray in np.flatnonzero(np.isfinite(looks.of_ray).all(axis=1)):
-        value, w = looks.of_ray[ray], np.where(looks.image[one[known]] != looks.image[ray], single[known], 0.0)
+        others = looks.image[one[known]] != looks.image[ray]
+        value, w, of_others = looks.of_ray[ray], np.where(others, single[known], 0.0), np.where(others, of_pairs, 0.0)
         parts = [np.log(UNKNOWN) + broad(value)]
         if w.sum() > 0:
-            parts.append(np.log(w.sum()) + _log_kernels(value, sample, w, KIND, float(w.sum())))
-        # markers look alike: kernels no wider than they must be, lest two hidden ones pass for a pair by their likeness
-        parts.append(np.log(presumed) + _log_density(value, sample, of_pairs, KIND, 2 * pairs))
+            parts.append(np.log(w.sum()) + log_kernels(value, sample, w, KIND, float(w.sum())))
+        if of_others.sum() > 0:
+            parts.append(np.log(presumed) + log_kernels(value, sample, of_others, KIND, 2 * pairs))
         density[ray] = np.logaddexp.reduce(parts) - np.log(total)
     return Alone(density, hidden)
 
@@ -164,7 +165,7 @@ def _hidden(alone: float, pairs: float) -> float:
     return min((alone + HIDDEN[0]) / (pairs + alone + HIDDEN[1]), 0.5)
 
 
-def _log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: float) -> float:
+def log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: float) -> float:
     """Return the log of a kernel density estimate; kernels of half of Scott's width, since there may be several kinds of balls."""
     middle = weight @ sample / weight.sum()
     spread = np.sqrt(weight @ (sample - middle) ** 2 / weight.sum())
@@ -172,7 +173,7 @@ def _log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: fl
 
 
 def _log_density(value: Float, sample: Float, weight: Float, width: Float, n: float) -> float:
-    kernels = (_log_student((value - sample) / width, n) - np.log(width)).sum(axis=1)
+    kernels = (log_student((value - sample) / width, n) - np.log(width)).sum(axis=1)
     with np.errstate(divide="ignore"):
         return float(np.logaddexp.reduce(kernels + np.log(weight / weight.sum())))
 
@@ -186,7 +187,8 @@ def _weighted_median(values: Float, weight: Float) -> Float:
     return result
 
 
-def _log_student(t: Float, freedom: float) -> Float:
+def log_student(t: Float, freedom: float) -> Float:
+    """Return the log density of Student's t distribution, of two degrees of freedom at least."""
     v = max(float(freedom), 2.0)
     scale = gammaln((v + 1) / 2) - gammaln(v / 2) - 0.5 * np.log(v * np.pi)
     result: Float = scale - (v + 1) / 2 * np.log1p(np.square(t) / v)

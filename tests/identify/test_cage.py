@@ -12,6 +12,8 @@ import pytest
 from rsa_vision.cages import Cage, Mark, Plane, load_cage
 from rsa_vision.flags import REASONS
 from rsa_vision.identify.cage import CageIdentification, identify_cage
+from rsa_vision.identify.film_model import build_scene
+from rsa_vision.identify.hypotheses import largest_overlap
 from rsa_vision.types import MarkerImages
 from synthetic.point_films import FilmTruth, expose, random_exposure, random_foci
 
@@ -341,3 +343,37 @@ def test_hidden_end_columns_with_other_foci_are_ambiguous() -> None:
         result = identify(replace(film, images=film.images.rows(kept)), cage, (1, 2))
         assert "cage-ambiguous" in result.reasons, f"seed {seed}"
         assert result.runner_up
+
+
+def test_hidden_end_column_of_long_rows_is_weighed_too() -> None:
+    """Of rows of eight, seven marks in eight fit all names moved by one: a film that shows so many is not complete."""
+    few = small_cage(2)
+    rows = [("fiducial", 25.0, 0.0, (0.0, 200.0), 1), ("control", 24.0, 150.0, (40.0, 160.0), 101)]
+    marks = [
+        Mark(number=first + 8 * j + i, role=role, foci=(1,), shape="ball", xyz=(step * (i - 3.5), y, z), diameter=0.8)  # type: ignore[arg-type]
+        for role, step, z, ys, first in rows
+        for j, y in enumerate(ys)
+        for i in range(8)
+    ]
+    cage = few.model_copy(update={"mark": tuple(marks)})
+    assert largest_overlap(build_scene(cage, (1,), {1: np.array(cage.foci[1])})) == 7 / 8
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        exposure = random_exposure(rng, cage, missing=0, false_images=5, turn_deg=3.0, slack_mm=0.0, foci_mm=random_foci(cage, rng, 40.0))
+        film = expose(cage, (1,), exposure, rng)
+        kept = np.array([source[0] != "mark" or source[3] not in {1, 9, 101, 109} for source in film.source])
+        assert "cage-ambiguous" in identify(replace(film, images=film.images.rows(kept)), cage, (1,)).reasons, f"seed {seed}"
+
+
+def test_three_of_eight_control_points_may_be_covered() -> None:
+    cage = load_cage("1B")
+    covered = {(1, 12), (1, 19), (2, 14), (2, 17), (2, 22)}
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        film = expose(cage, (1, 2), random_exposure(rng, cage, missing=0, false_images=10, turn_deg=2.0, noise_px=0.03), rng)
+        kept = np.array([source[0] != "mark" or (source[1], source[3]) not in covered for source in film.source])
+        film = replace(film, images=film.images.rows(kept), source=[s for s, keep in zip(film.source, kept, strict=True) if keep])
+        result = identify(film, cage, (1, 2))
+        assert result, f"seed {seed}"
+        assert "cage-ambiguous" not in result.reasons
+        assert film.errors(result.assignments) == []

@@ -272,3 +272,14 @@ def test_crowd_is_bounded_and_has_no_posterior() -> None:
     packing = pack(groups, rng.normal(2, 1, len(groups)))
     assert packing.chosen.any()
     assert np.isnan(packing.posterior).all()
+
+
+def test_a_marker_with_bone_before_one_image_is_paired() -> None:
+    """A contrast unlike that of the other pairs is no reason to doubt a crossing that nothing else meets."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        rays = rays_to(some_markers(13, rng), rng, shared=False, sd_mm=0.006)
+        rays.contrast[:2] *= 0.4  # images of markers 0 and 1 from focus 1
+        pairing = rays.pair()
+        assert not pairing.reasons, f"seed {seed}"
+        assert all(rays.right(group) for group in pairing.groups)

@@ -1,0 +1,72 @@
+"""Which images without a partner may be markers that the other focus does not show, and which are clutter.
+
+A hidden marker looks like the markers of the film (size, contrast) and lies among them; clutter looks like anything and lies anywhere.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy.special import expit, gammaln
+
+from rsa_vision.identify.pair_looks import KIND, WIDE, log_kernels, log_student
+from rsa_vision.types import Bool, Float
+
+PRESUMED: Final = (0.5, 0.05)  # markers that one focus does not show: that many, and that part of those both show
+FREEDOM: Final = 4.0  # of the places of markers on a film: another bone may lie apart
+LEAST_SPREAD: Final = 0.05  # of the places, as a part of the film's larger side
+UNSURE: Final = np.array([0.2, 0.4])  # error of the logs of size and contrast of an image that overlaps another or fits poorly
+
+
+def chance_of_marker(look: Float, place_px: Float, doubtful: Bool, paired: Bool, shape: tuple[int, int]) -> Float:
+    """Return how probable the images of one film are to be markers, by those that have a partner.
+
+    Parameters
+    ----------
+    look : ndarray of shape (n, 2)
+        Logarithms of radius and contrast.
+    place_px : ndarray of shape (n, 2)
+        (col, row).
+    doubtful : ndarray of bool, shape (n,)
+        Whether the look of an image says little.
+    paired : ndarray of bool, shape (n,)
+        Whether it has a partner.
+    shape : tuple of two ints
+        (rows, cols) of the film.
+
+    Returns
+    -------
+    ndarray of shape (n,)
+        1 for those with a partner; 0 for the others of a film without any: nothing tells what its markers look like.
+    """
+    result = paired.astype(float)
+    lone, teachers = np.flatnonzero(~paired), np.flatnonzero(paired)
+    if not len(lone) or not len(teachers):
+        return result
+    log_place = _log_density_of_places(place_px[lone], place_px[teachers], max(shape)) + np.log(shape[0] * shape[1])
+    part = (doubtful[teachers].sum() + 0.5) / (len(teachers) + 1)  # of markers; of clutter one half
+    odds = np.log(np.where(doubtful[lone], part, 1 - part) / 0.5) + log_place
+    odds += np.log((PRESUMED[0] + PRESUMED[1] * len(teachers)) / len(lone))
+    clear = teachers[~doubtful[teachers]]
+    if len(clear):
+        middle = np.median(look[clear], axis=0)
+        for k, row in enumerate(lone):
+            width = np.hypot(KIND, UNSURE if doubtful[row] else 0.0)
+            marker = log_kernels(look[row], look[clear], np.ones(len(clear)), width, len(clear))
+            anything = log_student((look[row] - middle) / WIDE, 3.0) - np.log(WIDE)
+            odds[k] += marker - float(anything.sum())
+    result[lone] = expit(odds)
+    return result
+
+
+def _log_density_of_places(places: Float, markers: Float, side: float) -> Float:
+    """Return the log density, per px2, of a bivariate t distribution about the markers."""
+    spread = (LEAST_SPREAD * side) ** 2 * np.eye(2)
+    middle = markers.mean(axis=0)
+    covariance = (spread + (markers - middle).T @ (markers - middle)) / max(len(markers) - 1, 1)
+    away = places - middle
+    squared = np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away)
+    constant = gammaln(FREEDOM / 2 + 1) - gammaln(FREEDOM / 2) - np.log(FREEDOM * np.pi) - 0.5 * np.linalg.slogdet(covariance)[1]
+    result: Float = constant - (FREEDOM / 2 + 1) * np.log1p(squared / FREEDOM)
+    return result
