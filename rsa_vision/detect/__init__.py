@@ -33,6 +33,7 @@ STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which the
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
+_OF_A_TEE = 2.0  # evidence that the thick ends of a tee's arms may feign
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,8 +95,9 @@ def _polarities(
     for sign in (-1, 1):
         optics[sign], balls = estimate_optics(film, seeds.rows(np.sign(seeds.depth) == sign), noise)
         strength = -sign * candidates.junctions[:, 4]
-        if balls < _LEAST_EVIDENCE and (strength > CLEAR_JUNCTION).any():
-            optics[sign] = optics_of_tees(film, candidates.junctions[strength > CLEAR_JUNCTION], noise)
+        clear = strength > CLEAR_JUNCTION
+        if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
+            optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
             optics[sign], balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
         weight[sign] = balls + float(np.clip(strength - CLEAR_JUNCTION, 0.0, 20.0).sum())

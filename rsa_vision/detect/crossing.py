@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import polynomial
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, beyond_ends, core_pixels, support
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, beyond_ends, core_pixels, significance_of, support
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
@@ -112,14 +112,12 @@ def fit_crossing(
     influence[:, (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)] = covariance @ (jac * np.sqrt(weight)[:, None]).T
     out = []
     square = weight * residual**2
-    depth_at = each * len(now)
     for i, (f, block) in enumerate(zip(now, blocks, strict=True)):
         image = f.depths @ block[0]
         depth = float(f.depths.mean())
         core = np.abs(image) > 0.08 * max(float(np.abs(image).max()), 1e-9)
         chi2_core = float(square[core].mean()) if core.any() else np.inf
         raised = float((weight * (residual + image) ** 2)[core].sum())
-        index = slice(depth_at + starts[i], depth_at + starts[i + 1])
         variance = float(noise.variance_at(np.array([theta[-6]]))[0])
         out.append(
             replace(
@@ -132,7 +130,7 @@ def fit_crossing(
                 chi2_core=chi2_core,
                 explained=1.0 - float(square[core].sum()) / max(raised, 1e-12),
                 misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
-                significance=float(abs(depth) / np.sqrt(max(covariance[index, index].mean(), 1e-30))),
+                significance=significance_of(image, surface, weight),
                 converged=converged,
             )
         )

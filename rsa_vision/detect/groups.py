@@ -77,7 +77,9 @@ def fit_group(
 
     def linear_part(value: Float) -> tuple[Float, list[tuple[int, int]], list[Float]]:
         # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
-        pairs, columns, slopes = [], [], []
+        pairs: list[tuple[int, int]] = []
+        columns: list[Float] = []
+        slopes: list[Float] = []
         for pair in lapping(local, radius):
             product, by = product_image(local[list(pair)], radius[list(pair)], sigma_px, mu_px, patch.size)
             if product.max() > LEAST:

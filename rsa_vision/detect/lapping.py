@@ -37,7 +37,7 @@ def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, si
     Returns
     -------
     value : ndarray of shape (size * size,)
-        Of ``(1 - exp(-mu c_1)) (1 - exp(-mu c_2))``, ``c`` being the chords, after the blur. Together with the sum of the two images it makes
+        Of ``(1 - exp(-mu c_1)) (1 - exp(-mu c_2))``, ``c`` being the chords, blurred. With the sum of the two images it makes
         the opacity of both chords in one beam: ``1 - exp(-mu (c_1 + c_2))``.
     slopes : ndarray of shape (2, 3, size * size)
         Its derivatives by the (col, row, radius) of either ball.
@@ -53,9 +53,7 @@ def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, si
     if (last <= first).any():
         return value.ravel(), slopes.reshape(2, 3, -1)
     # two pixels more on each side, for the blur not to meet the border of the box
-    x, y = (
-        (np.arange((high - low + 4) * FINE) + 0.5) / FINE - 2.5 + low - at for low, high, at in zip(first, last, local[0], strict=True)
-    )
+    x, y = ((np.arange((high - low + 4) * FINE) + 0.5) / FINE - 2.5 + low - at for low, high, at in zip(first, last, local[0], strict=True))
 
     def image(dx: float, dy: float, r1: float, r2: float) -> Float:
         def opacity(x: Float, y: Float, r: float) -> Float:

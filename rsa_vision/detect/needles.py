@@ -26,6 +26,7 @@ _PAD = 6.0  # blur widths around the needle that a table covers
 _STEPS = 14
 _CONVERGED_PX = 5e-4
 _CLOSE_PX = 0.03
+STANDS_OUT = 15.0  # significance from which noise may hide the form: what is chosen of a film's places stands out less
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,8 @@ class NeedleFit:
     chi2_core, chi2_ring, explained, valid_fraction, misfit : float
         As in :class:`rsa_vision.detect.balls.BallFits`; ``misfit`` is the RMS residual beyond the noise as a fraction of the depth.
     significance : float
-        Depth over its standard deviation.
+        Depth over its standard deviation at the fitted shape: depth and width of a thin needle can stand for each other, so that neither is
+        sure alone; that something is there is.
     converged : bool
     """
 
@@ -321,7 +323,6 @@ def fit_needles(
     raised = float((weight * (residual + image) ** 2)[core].sum())
     background = float(theta[n_depth])
     variance = float(noise.variance_at(np.array([background]))[0])
-    spread = covariance[n_free : n_free + n_depth, n_free : n_free + n_depth].mean()  # variance of the mean depth
     full = core_pixels(tip, angles, shape, optics.sigma_px, ends)
     return NeedleFit(
         position_px=tip,
@@ -337,9 +338,24 @@ def fit_needles(
         explained=1.0 - float(square[core].sum()) / max(raised, 1e-12),
         valid_fraction=min(1.0, n_core / max(full, 1)),
         misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
-        significance=float(abs(depth) / np.sqrt(max(spread, 1e-30))),
+        significance=significance_of(image, surface, weight),
         converged=converged,
     )
+
+
+def significance_of(image: Float, surface: Float, weight: Float) -> float:
+    """Return how many standard deviations an image (n,) stands out of any background (n, p), its shape being given."""
+    over, under = np.sqrt(weight) * image, np.sqrt(weight)[:, None] * surface
+    return float(np.linalg.norm(over - under @ np.linalg.lstsq(under, over, rcond=None)[0]))
+
+
+def explains(fit: NeedleFit, least: float) -> bool:
+    """Say whether a fit explains a part of what is under it: of all, or, where it stands out, of what is more than the noise."""
+    left = fit.chi2_core
+    raised = left / max(1.0 - fit.explained, 1e-9)
+    over_noise = 1.0 - max(left - 1.0, 0.0) / max(raised - 1.0, 1e-9)
+    stands_out = fit.significance / np.sqrt(max(fit.chi2_ring, 1.0)) > STANDS_OUT
+    return bool(fit.explained > least or (raised > 1.0 and over_noise > least and stands_out))
 
 
 def core_pixels(tip: Float, angles: Float, shape: NeedleShape, sigma: float, ends: bool) -> int:

@@ -62,17 +62,17 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     chosen = np.argsort(closest)[:_MOST_SEEDS]
     chosen = chosen[closest[chosen] < max(0.08, 1.5 * closest[chosen[0]])]
     position, radius = position[chosen], radius[chosen]
-    sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen), s) for s, t in zip(SIGMAS_PX, trials, strict=True)])
+    sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen)) for t in trials])
     # what came close at another blur only, as two balls in one at a wide one, is none of the film's balls
     close = _closeness(fit(sigma, KAPPA), noise)
     kept = close < max(_CLOSE, _UNLIKE * float(np.sort(close)[len(close) // 4]))
     if not kept.all():
         chosen, position, radius = chosen[kept], position[kept], radius[kept]
-        sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen), s) for s, t in zip(SIGMAS_PX, trials, strict=True)])
-    kappa = round(refine(KAPPAS, [_cost(fit(sigma, k), sigma) for k in KAPPAS]), 2)
+        sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen)) for t in trials])
+    kappa = round(refine(KAPPAS, [_cost(fit(sigma, k)) for k in KAPPAS]), 2)
     near = [sigma * f for f in NEAR]
     last = [fit(s, kappa) for s in near]
-    sigma = refine(tuple(near), [_cost(t, s) for s, t in zip(near, last, strict=True)])
+    sigma = refine(tuple(near), [_cost(t) for t in last])
     evidence = max(ball_evidence(t, noise) for t in last)
     return Optics(sigma, kappa / sigma), evidence
 
@@ -81,6 +81,6 @@ def _closeness(fits: BallFits, noise: NoiseModel) -> Float:
     return misfit(fits, noise) + (1 - fits.explained)
 
 
-def _cost(fits: BallFits, sigma: float) -> float:
-    area = np.pi * (fits.radius_px + sigma) ** 2
-    return float((area * np.log(np.maximum(fits.chi2_core, 0.05))).sum())
+def _cost(fits: BallFits) -> float:
+    """Minus twice a log-likelihood: of noise where the model is nearly right, of errors of unknown size where it is far off."""
+    return float(2 * np.log1p(fits.chi2_core).sum())

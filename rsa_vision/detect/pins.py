@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
 from rsa_vision.detect.needle_sets import TAPERS, common_optics, fit_all, with_error_of_optics
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
@@ -63,7 +63,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
             tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
             fits.append(fit_needles(film, tip, np.array([turn]), start, guess, noise, quick=True))
         best = max(fits, key=lambda f: f.explained)
-        if best.explained > _ROUGH:
+        if explains(best, _ROUGH):
             found.append(best)
             in_vain = 0
         if in_vain == _MOST_IN_VAIN:
@@ -183,7 +183,7 @@ def is_pin(fit: NeedleFit) -> bool:
     """Say whether a fit looks like a pin: little misfit, slim, all of it on the film."""
     if not np.isfinite(fit.misfit) or fit.significance < _SIGNIFICANT or fit.valid_fraction < 0.9:
         return False
-    return bool(is_slim(fit) and fit.misfit < MISFIT and fit.explained > EXPLAINED)
+    return bool(is_slim(fit) and fit.misfit < MISFIT and explains(fit, EXPLAINED))
 
 
 def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:

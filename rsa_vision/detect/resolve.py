@@ -94,6 +94,7 @@ def resolve_balls(
         return single.rows(np.zeros(len(single.depth), bool)), np.zeros(0, bool)
     found = join(fits)
     found = found.rows(plausible(found, noise) & inside(found, film))
+    found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
     found = _beside_edges(film, distinct(found, noise), optics, noise, tees)
     near = [len(g) > 1 for g in _groups(found, optics)]
     touching = np.zeros(len(found.depth), bool)
@@ -150,6 +151,13 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
     n = np.pi * (fits.radius_px + 1) ** 2
     unlike = (left > _UNLIKE * np.median(misfit(known, noise))) & (left > _LEAST_UNLIKE) & (fits.chi2_core > 1 + 5 * np.sqrt(2 / n))
     return np.asarray(unlike & (fits.radius_px > _LARGER * np.median(known.radius_px)))
+
+
+def _in_one_beam(fits: BallFits) -> Bool:
+    """Say whose shadow lies over that of another ball."""
+    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
+    over = gap < fits.radius_px[:, None] + fits.radius_px[None]
+    return np.asarray((over & ~np.eye(len(gap), dtype=bool)).any(axis=1))
 
 
 def _taken(fits: BallFits, good: BallFits) -> Bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.crossing import fit_crossing
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.needle_sets import TAPERS, clusters, common_optics, fit_all, others_beside
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, fit_needles
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.templates import find_like
@@ -106,7 +106,7 @@ def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
     turn = np.angle(np.exp(1j * (fit.angles - fit.angles[0])))
     square = abs(turn[1] - np.pi / 2) < 0.35 and abs(turn[2] + np.pi / 2) < 0.35
     slim = fit.shape.length_px > 2.0 * fit.shape.half_width_px
-    return bool(square and slim and fit.misfit < 1.3 * MISFIT * slack and fit.explained > 1 - (1 - EXPLAINED) * slack)
+    return bool(square and slim and fit.misfit < 1.3 * MISFIT * slack and explains(fit, 1 - (1 - EXPLAINED) * slack))
 
 
 def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
