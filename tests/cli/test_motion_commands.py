@@ -190,6 +190,7 @@ def test_wrong_usage_is_refused(markers: Path, tmp_path: Path, capsys: pytest.Ca
         (["motion", str(markers), "--side", "front"], "side"),
         (["precision", str(markers)], "no double examination"),
         (["growth", str(markers), "--material", "wood"], "material 'wood' is not known"),
+        (["growth", str(markers), "--temperature-c", "74"], "temperature 74 is none of a room"),
     ):
         assert run_app(arguments) == 2
         assert said in capsys.readouterr().err
