@@ -143,7 +143,7 @@ def measure(
     record = _record("measure", started, folder, study_file, settled, about) | {
         "options": options,
         "inputs": [
-            {"path": str(film.path.resolve()), "sha256": outcome.inputs.get(film.path.name)}
+            {"path": str(film.path.absolute()), "sha256": outcome.inputs.get(film.path.name)}
             for files, outcome in zip(grouping.exams, outcomes, strict=True)
             for film in files.films
         ],

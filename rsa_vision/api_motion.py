@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 UNNAMED: Final = "-"  # stands for the segment of markers without one
+ROOM_C: Final = 50.0  # as in the study file
 REMEDY: Final = "fill in the column segment, or give the known segments when measuring"
 
 
@@ -163,6 +164,8 @@ def growth(
 
     if material_name(material) not in EXPANSION_PER_C:
         raise UsageError(f"material {material!r} is not known; use one of {', '.join(EXPANSION_PER_C)}")
+    if not 0 <= (temperature_c or 0) <= ROOM_C:
+        raise UsageError(f"temperature {temperature_c:g} is none of a room; give that of the cage, 0 to {ROOM_C:g} degrees C")
     scale = 1.0 if temperature_c is None else 1 + EXPANSION_PER_C[material_name(material)] * (temperature_c - calibrated_at_c)
     given = read_markers(Path(source))
     series = make_series(_all_named(given), given.status)

@@ -18,7 +18,7 @@ from rsa_vision.errors import FilmError, RsaError, UsageError
 from rsa_vision.provenance import file_sha256, version
 from rsa_vision.settings import Study
 from rsa_vision.store import fingerprint, is_finished, read_record, record_path, write_record
-from rsa_vision.study_files import ExamFiles
+from rsa_vision.study_files import ExamFiles, printable
 from rsa_vision.tables import Rows, examination_rows, failed_rows
 
 if TYPE_CHECKING:
@@ -129,6 +129,8 @@ def measure_task(task: Task) -> Outcome:
     path = record_path(task.out, files.subject, files.exam)
     inputs: dict[str, str] = {}
     try:
+        if strange := [film.path for film in files.films if film.path.exists() and not film.path.is_file()]:
+            raise FilmError(f"{strange[0]}: a pipe or a device, whose reading may never end; copy the film into the folder")
         inputs = {film.path.name: file_sha256(film.path) for film in files.films}
         wanted = fingerprint({**task.depends_on, "version": version(), "exam": [files.subject, files.exam], "films": inputs})
         record = read_record(path)
@@ -173,7 +175,7 @@ def _failed(
     files: ExamFiles, code: str, message: str, started: float | None = None, inputs: Mapping[str, str] | None = None, trace: str = ""
 ) -> Outcome:
     seconds = perf_counter() - started if started is not None else 0.0
-    rows = failed_rows(files.subject, files.exam, [film.path.name for film in files.films], code, message, seconds)
+    rows = failed_rows(files.subject, files.exam, [printable(film.path.name) for film in files.films], code, message, seconds)
     return Outcome(files.subject, files.exam, rows, False, inputs or {}, trace)
 
 

@@ -109,6 +109,7 @@ def measure(
 ) -> int:
     """Measure every examination in a folder of films, unattended."""
     from rsa_vision import api
+    from rsa_vision.study_files import printable
 
     with _progress() as watch:
         summary = api.measure(
@@ -132,7 +133,7 @@ def measure(
         )
     for path, why in summary.ignored:
         if why == "no DICOM file":  # all else that is ignored could not be taken for a film
-            print(f"ignored: {path.name} ({why})", file=sys.stderr)
+            print(f"ignored: {printable(path.name)} ({why})", file=sys.stderr)
     _print_summary(summary)
     return summary.exit_code
 

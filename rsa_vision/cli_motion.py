@@ -57,6 +57,7 @@ def growth(
         name = f"{row['subject'] or ''} {row['exam_from']} -> {row['exam_to']}".strip()
         if row["status"] != "ok":
             print(f"{name}: {row['status']} ({row['reasons']})")
+        if row["rmsv_um"] is None:
             continue
         more = "" if row["s0_um"] is None else f", s0 {row['s0_um']:.1f} um, scale {row['scale_ppm']:+.0f} ppm"
         print(f"{name}: {row['n_lengths']} lengths, RMSV {row['rmsv_um']:.1f} um{more}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
+from typing import Final
 
 import numpy as np
 
@@ -23,6 +24,10 @@ from rsa_vision.settings import Study
 from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
 from rsa_vision.xray import rays_of, reconstruct, reconstruct_calibrated, solve_focus
+
+TIP_ERROR: Final = 0.01
+"""Part of the half width: what the fits of all points of a cage have in common where the points are no cones (rounded, or cylinders with
+a short point). Root mean square over 33 films of another renderer; at the worst 3 %."""
 
 ExposedFilm = tuple[Film, int | None]
 """A film and the focus that it belongs to, None for all foci."""
@@ -170,7 +175,7 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
     slant = np.abs(np.einsum("ij,ij->i", bundle.direction, normals))
     pairing = _pair(table, bundle, scale, study, region, slant=slant)
     complete = name_objects(named, table, bundle, pairing, foreign)
-    reconstruction = reconstruct(complete.points, cage, study.limits)
+    reconstruction = reconstruct(complete.points, cage, study.limits, TIP_ERROR)
     findings += _pair_findings(pairing, study) + lonely_images(table, pairing, bundle)
     return _judged(complete, reconstruction, findings + judge(reconstruction, _nominal(study, cage), study.limits))
 

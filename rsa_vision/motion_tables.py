@@ -15,6 +15,7 @@ from rsa_vision.kinematics.kinema import BESIDE, NUMBERS, Columns, follow_up_pai
 from rsa_vision.kinematics.precision import summarise
 from rsa_vision.kinematics.rigidity import rigidity
 from rsa_vision.kinematics.series import Series
+from rsa_vision.motion_reasons import BIT, joined, status_of
 from rsa_vision.settings import Limits, Motion
 from rsa_vision.store import parquet_bytes, to_csv, write_atomic
 from rsa_vision.tables import NUMBER, TEXT, TRUTH, WHOLE, Row, frame
@@ -141,6 +142,7 @@ def growth_tables(series: Sequence[Series], standard: Sequence[Series] | None, s
     given = {one.subject: one for one in standard or ()}
     for one in series:
         places = _places(one)
+        twice = {exam for segment in one.segments for exam, some in zip(one.exams, segment.duplicate, strict=True) if some.any()}
         if standard is None:
             pairs = [(one.exams[a], one.exams[b], places[a], places[b], one.days[b] - one.days[a], scale) for a, b in follow_up_pairs(one)]
         else:
@@ -158,12 +160,19 @@ def growth_tables(series: Sequence[Series], standard: Sequence[Series] | None, s
             errors = [np.stack([some[name][1] for name in common]) for some in (before, after)]
             found = compare_lengths(first * factor, second * scale, *errors)
             summary |= {"rmsv_um": found.rmsv_um, "s0_um": found.s0_um, "scale_ppm": found.scale_ppm, "form": found.form}
-            growth.append(key | summary | {"status": "ok", "reasons": "" if len(common) > 2 else "too-few-markers"})
+            growth.append(key | summary | _growth_verdict(found.form, len(common), twice & {start, end}))
             for k, (i, j) in enumerate(zip(found.first, found.second, strict=True)):
                 ends = dict(zip(("segment_a", "marker_a", "segment_b", "marker_b"), (*common[i], *common[j]), strict=True))
                 numbers = {name: getattr(found, name)[k] for name in ("length_from_mm", "length_to_mm", "difference_um", "sd_um")}
                 lengths.append(key | ends | numbers)
     return frame(lengths, LENGTHS), frame(growth, GROWTH)
+
+
+def _growth_verdict(form: str, n_points: int, twice: set[str]) -> Row:
+    """Return status and reasons: lengths are the same in a mirror, so that only here it shows."""
+    bits = (BIT["mirrored"] if form == "mirrored" else 0) | (BIT["marker-duplicate"] if twice else 0)
+    reasons = ["too-few-markers"] if n_points < 3 else []  # for a scale; the one length is determined
+    return {"status": status_of(bits), "reasons": ";".join([*filter(None, [joined(bits)]), *reasons])}
 
 
 def _places(series: Series, exact: bool = False) -> list[dict[tuple[str, str], tuple[Any, Any]]]:

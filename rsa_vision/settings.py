@@ -13,7 +13,8 @@ from rsa_vision.errors import SettingsError
 Response = Literal["auto", "density", "transmission", "linear", "log"]
 Orientation = Literal["upright", "any", "mirrored"]
 FilmMode = Literal["shared", "separate"]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]  # strict: true is no number, nor is "0.1"
+RoomC = Annotated[float, Field(ge=0, le=50, strict=True)]  # 74 (Fahrenheit) would scale a cage by 0.4 %, and nothing would show it
 Vector = tuple[Finite, Finite, Finite]
 ORTHONORMAL: Final = 1e-3  # how well the axes of an anatomical frame must be at right angles
 
@@ -82,9 +83,9 @@ class Study(Frozen):
     cage: str | None = None
     film: FilmMode | None = None
     response: Response = "auto"
-    pixel_pitch_mm: Annotated[float, Field(gt=0)] | None = None
+    pixel_pitch_mm: Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)] | None = None
     orientation: Orientation = "upright"
-    temperature_c: Finite | None = None
+    temperature_c: RoomC | None = None
     file_pattern: str | None = None
     foci: dict[int, Vector] = {}
     calibration: dict[int, Path] = {}
@@ -120,7 +121,8 @@ def load_study(path: Path) -> Study:
     Parameters
     ----------
     path : Path
-        A TOML file as in ``interfaces.md``; paths in it are taken relative to it.
+        A TOML file as in ``interfaces.md``; paths in it are taken relative to it. ``calibration`` may stand below ``[foci]``, where TOML
+        makes it a part of that table.
 
     Returns
     -------
@@ -132,9 +134,12 @@ def load_study(path: Path) -> Study:
         If the file cannot be read, is no TOML, or has unknown keys or wrong values (all are listed).
     """
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SettingsError(f"{path}: not a readable TOML file ({error})") from error
+    below = raw.get("foci")
+    if isinstance(below, dict) and "calibration" in below and "calibration" not in raw:
+        raw["calibration"] = below.pop("calibration")
     try:
         study = Study.model_validate(raw)
     except ValidationError as error:

@@ -49,7 +49,12 @@ class Grouping:
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Return a key that sorts numbers in text by their value (``9`` before ``10`` before ``10b``)."""
-    return tuple((0, int(part), part) if part.isdigit() else (1, 0, part) for part in re.findall(r"\d+|\D+", text))
+    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", text))
+
+
+def printable(name: str) -> str:
+    r"""Return a file name as it can be printed and written: bytes that are no UTF-8 as ``\udcff``."""
+    return name.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def compile_pattern(pattern: str | None) -> re.Pattern[str] | None:
@@ -135,6 +140,10 @@ def group_films(
     grouped: dict[tuple[str, str], list[FilmFile]] = {}
     unnamed: list[ExamFiles] = []
     for path in films:
+        if (shown := printable(path.name)) != path.name:
+            problem = "film-name", f"{shown}: the name is no UTF-8, and tables could not say it; rename the file"
+            unnamed.append(ExamFiles(printable(path.stem), "", (FilmFile(path, None),), problem))
+            continue
         named = _name(path, pattern) or _name_by_tags(tags_of(path) or {}, path)
         if named is None:
             problem = "film-name", f"{path.name}: the name is not {_rule(file_pattern)}; rename the file or set file_pattern in study.toml"
@@ -158,6 +167,8 @@ def _no_film(path: Path, tags_of: TagReader) -> str | None:
         return "folder"
     if path.suffix.lower() in FILM_SUFFIXES:
         return None
+    if not path.is_file() and path.exists():  # a pipe or a device: reading may never end
+        return "no regular file"
     if not path.suffix or path.suffix[1:].isdigit():  # DICOM files are often named by their UID: the "suffix" is its last number
         return None if tags_of(path) is not None else "no DICOM file"
     return "no film by its extension"

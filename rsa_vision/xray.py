@@ -37,7 +37,7 @@ _MEDIAN_CHI2 = 0.455  # of one degree of freedom
 Groups = dict[str, list[int]]
 
 
-def reconstruct(points: ImagePoints, cage: Cage, limits: Limits) -> Reconstruction:
+def reconstruct(points: ImagePoints, cage: Cage, limits: Limits, tip_error: float = 0.0) -> Reconstruction:
     """Reconstruct the markers of one examination with a cage.
 
     Parameters
@@ -48,6 +48,8 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits) -> Reconstructi
         At the temperature of the examination (:meth:`Cage.at_temperature`).
     limits : Limits
         ``fiducial_um``, ``line_mm`` and ``crossing_sigma`` are used.
+    tip_error : float
+        As of :func:`rsa_vision.geometry.focus.solve_focus`.
 
     Returns
     -------
@@ -62,7 +64,7 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits) -> Reconstructi
         remedy.
     """
     _require_foci(points, cage)
-    fits = {int(focus): solve_focus(points.rows(points.focus == focus), cage, int(focus), limits) for focus in _foci(points)}
+    fits = {focus: solve_focus(points.rows(points.focus == focus), cage, focus, limits, tip_error) for focus in _foci(points)}
     plane = np.full((len(points), 3), np.nan)
     residual = np.full(len(points), np.nan)
     used = np.zeros(len(points), bool)

@@ -18,6 +18,7 @@ from rsa_vision.types import Float
 
 _STEPS = 16
 _CONVERGED_PX = 1e-3
+_LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
 _GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
 
 
@@ -87,7 +88,7 @@ def fit_crossing(
         ]
         images = [b[0].sum(0, keepdims=True) if ends else b[0] for b in blocks]
         counts = [len(i) for i in images]
-        linear = np.column_stack([*np.concatenate(images), surface])
+        linear = np.column_stack([*np.concatenate(images), *_lapping([b[0].sum(0) for b in blocks]), surface])
         theta = weighted_least_squares(linear, weight, data, 1e-6)
         ground = surface[:, 1:] @ theta[-surface.shape[1] + 1 :]
         starts = np.concatenate([[0], np.cumsum(counts)])
@@ -135,6 +136,16 @@ def fit_crossing(
             )
         )
     return out
+
+
+def _lapping(shadows: Sequence[Float]) -> list[Float]:
+    """Return the product of the shadows of two needles, summed over all pairs, if any lie on each other.
+
+    There the film does not show their sum: its curve is bent, and those of two exposures take of each half the light. How much of the
+    product it shows, the film tells; left out, it draws the two towards each other.
+    """
+    product = (np.sum(shadows, axis=0) ** 2 - np.sum(np.square(shadows), axis=0)) / 2
+    return [product] if product.max(initial=0.0) > _LAPPING else []
 
 
 def _gain(fit: NeedleFit, ground: Float, optics: Optics) -> Float | float:

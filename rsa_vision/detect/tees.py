@@ -220,9 +220,12 @@ def _effect_of_directions(film: NDArray[Any], tees: list[NeedleFit], error: Floa
     """Return the covariance of a tip by errors of the common directions, shape (2, 2): shifts of the cleanest tee, each arm turned."""
     tee = min(tees, key=lambda f: f.misfit)
     others = others_beside(tee, [t for t in tees if t is not tee], optics, ends=True)
-    effect = np.zeros((2, 2))
+
+    def tip(angles: Float) -> Float:
+        return fit_crossing(film, [replace(tee, angles=angles)], optics, noise, others=others)[0].position_px
+
+    middle, effect = tip(tee.angles), np.zeros((2, 2))  # not where it was: it may have been fitted together with others
     for k in np.nonzero(error)[0]:
-        start = replace(tee, angles=tee.angles + error[k] * (np.arange(len(error)) == k))
-        shift = fit_crossing(film, [start], optics, noise, others=others)[0].position_px - tee.position_px
+        shift = tip(tee.angles + error[k] * (np.arange(len(error)) == k)) - middle
         effect += np.outer(shift, shift)
     return effect

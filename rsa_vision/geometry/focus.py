@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsa_vision.cages import Cage
+from rsa_vision.cages import Cage, Mark
 from rsa_vision.errors import GeometryError
 from rsa_vision.flags import MarkerFlag
-from rsa_vision.geometry.covariance import filled_covariance, homography_errors, propagate, resection_errors
+from rsa_vision.geometry.covariance import blocks, filled_covariance, homography_errors, propagate, resection_errors
 from rsa_vision.geometry.gross_errors import drop_gross_errors
 from rsa_vision.geometry.homography import apply_homography, fit_homography, homography_jacobians
 from rsa_vision.geometry.rays import RayBundle
@@ -50,7 +50,7 @@ class FocusFit:
     focus_by_image: Float
 
 
-def solve_focus(points: ImagePoints, cage: Cage, focus: int, limits: Limits) -> FocusFit:
+def solve_focus(points: ImagePoints, cage: Cage, focus: int, limits: Limits, tip_error: float = 0.0) -> FocusFit:
     """Fit the fiducial plane to the film and locate the focus, with the rules for gross errors.
 
     Parameters
@@ -62,6 +62,8 @@ def solve_focus(points: ImagePoints, cage: Cage, focus: int, limits: Limits) -> 
     focus : int
     limits : Limits
         ``fiducial_um`` and ``line_mm`` are used.
+    tip_error : float
+        Standard deviation of what all points of the cage have in common (:func:`tip_shift`), as a part of their half width.
 
     Returns
     -------
@@ -78,7 +80,7 @@ def solve_focus(points: ImagePoints, cage: Cage, focus: int, limits: Limits) -> 
     the residuals show. Where the residuals are significantly larger than stated covariances predict, these are inflated (Birge ratio).
     """
     try:
-        return _solve(points, cage, focus, limits)
+        return _solve(points, cage, focus, limits, tip_error)
     except GeometryError as error:
         raise GeometryError(f"focus {focus}: {error}") from error
 
@@ -136,7 +138,7 @@ def rays_of(
     )
 
 
-def _solve(points: ImagePoints, cage: Cage, focus: int, limits: Limits) -> FocusFit:
+def _solve(points: ImagePoints, cage: Cage, focus: int, limits: Limits, tip_error: float) -> FocusFit:
     px = points.position_px
     flags, mark = _match(points, cage, focus)
     fiducials = np.flatnonzero((mark >= 0) & (points.role == "fiducial"))
@@ -175,7 +177,8 @@ def _solve(points: ImagePoints, cage: Cage, focus: int, limits: Limits) -> Focus
     rows, lines = fiducials[kept_fiducials], controls[kept_controls]
     first = homography_errors(matrix, px[rows])
     second = resection_errors(matrix, basis, px[lines], plane[lines], xyz[mark[lines]], position)
-    by_cage = _cage_steps(cage, mark[rows], mark[lines], given_uv[kept_fiducials], origin, basis, position)
+    steps = _cage_errors(cage, tip_error)
+    by_cage = _cage_steps(steps, mark[rows], mark[lines], given_uv[kept_fiducials], origin, basis, position)
     errors = propagate(points, (rows, lines), (first, second), by_cage, (shift[kept_fiducials].ravel(), line_residuals.ravel()))
     focus_by_image = np.zeros((len(px), 3, 2))
     focus_by_image[lines] = second.focus_by_image.reshape(3, -1, 2).swapaxes(0, 1) * errors.control_birge
@@ -222,21 +225,43 @@ def _match(points: ImagePoints, cage: Cage, focus: int) -> tuple[Int, Int]:
     return flags, mark
 
 
-def _cage_steps(
-    cage: Cage, fiducials: Int, controls: Int, given_uv: Float, origin: Float, basis: Float, focus_mm: Float
-) -> tuple[Float, Float]:
-    """Shifts for one standard deviation of each of the m cage coordinates: fiducial marks in the plane (2 n, m), controls (3 n, m)."""
+def tip_shift(mark: Mark) -> Float:
+    """Return the shift of a tip, or of the point where three tips meet, for points that are longer by one half width, mm.
+
+    Parameters
+    ----------
+    mark : Mark
+
+    Returns
+    -------
+    ndarray of shape (3,)
+        Along the arms; the two of a tee that are opposite cancel, its stem stays. 0 for balls.
+    """
+    arms = np.array(mark.arms).reshape(-1, 3)
+    shift: Float = -(arms / np.linalg.norm(arms, axis=1, keepdims=True)).sum(axis=0) * mark.diameter / 2
+    return shift
+
+
+def _cage_errors(cage: Cage, tip_error: float) -> Float:
+    """Shifts of every mark for one standard deviation of each of the m errors of the cage, shape (marks, 3, m).
+
+    All tips were ground alike and are seen by one method: where they end is one error for all of them, which no residual shows.
+    """
+    n = len(cage.mark)
     deviations = np.array([item.sd or (0.0, 0.0, 0.0) for item in cage.mark])
-    count = 3 * len(cage.mark) if deviations.any() else 0
-    on_plane, in_space = np.zeros((len(fiducials), 2, count)), np.zeros((len(controls), 3, count))
-    if count:
-        normal = np.cross(basis[0], basis[1])
-        height = (focus_mm - origin) @ normal
-        foot = (focus_mm - origin) @ basis.T
-        for row, index in enumerate(fiducials):
-            # a mark off the plane is seen along its ray
-            seen = basis + np.outer((given_uv[row] - foot) / height, normal)
-            on_plane[row, :, 3 * index : 3 * index + 3] = seen * deviations[index]
-        for row, index in enumerate(controls):
-            in_space[row, :, 3 * index : 3 * index + 3] = np.diag(deviations[index])
-    return on_plane.reshape(2 * len(fiducials), count), in_space.reshape(3 * len(controls), count)
+    own = blocks(deviations[:, :, None] * np.eye(3)).reshape(n, 3, 3 * n)[..., : 3 * n if deviations.any() else 0]
+    common = tip_error * np.array([tip_shift(item) for item in cage.mark])
+    return np.concatenate([own, common[:, :, None]], axis=2) if common.any() else own
+
+
+def _cage_steps(
+    errors: Float, fiducials: Int, controls: Int, given_uv: Float, origin: Float, basis: Float, focus_mm: Float
+) -> tuple[Float, Float]:
+    """Shifts for one standard deviation of each of the m errors of the cage: fiducial marks in the plane (2 n, m), controls (3 n, m)."""
+    count = errors.shape[2]
+    normal = np.cross(basis[0], basis[1])
+    height = (focus_mm - origin) @ normal
+    foot = (focus_mm - origin) @ basis.T
+    # a mark off the plane is seen along its ray
+    seen = basis + (given_uv - foot)[:, :, None] / height * normal
+    return (seen @ errors[fiducials]).reshape(2 * len(fiducials), count), errors[controls].reshape(3 * len(controls), count)

@@ -10,6 +10,8 @@ import numpy as np
 from rsa_vision.geometry.rigid import best_rotation
 from rsa_vision.types import Float
 
+MIRROR_RATIO: Final = 4.0  # a mirror image that fits so much better (sums of squares) is the truth
+LEAST_SHARE: Final = 1e-6  # of the model's own sum of squares: less is a flat model, which is its own mirror image
 ROD: Final = 0.02  # spread about the best line over that along it, below which a model is a rod
 UM: Final = 1000.0
 PPM: Final = 1e6
@@ -33,7 +35,8 @@ class Growth:
         The scale: how much longer the model is.
     form : str
         ``rod``: points in line, coordinates along it, ``s0^2 = sum v^2 / (n - 2)``. ``model``: points in space, whose rotation is taken out
-        as well, ``s0^2 = sum v^2 / (3 n - 7)``.
+        as well, ``s0^2 = sum v^2 / (3 n - 7)``. ``mirrored``: points whose mirror image fits far better; they have no s0 and no scale.
+        Empty where the points lie in one place.
     """
 
     first: np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -86,6 +89,8 @@ def _hallert(source: Float, target: Float) -> tuple[float, float, str]:
     if n < 3:
         return np.nan, np.nan, ""
     before, after = source - source.mean(axis=0), target - target.mean(axis=0)
+    if not ((before**2).sum() > 0 and (after**2).sum() > 0):
+        return np.nan, np.nan, ""
     _, singular, right = np.linalg.svd(before)
     if np.hypot(singular[1], singular[2]) < ROD * singular[0]:
         # along its own line at each time: how a rod lies is no error
@@ -94,7 +99,12 @@ def _hallert(source: Float, target: Float) -> tuple[float, float, str]:
         place = after @ other * np.sign((after @ other) @ along)
         scale = float(place @ along / (along @ along))
         return float(np.sqrt(((place - scale * along) ** 2).sum() / (n - 2))), scale - 1, "rod"
-    rotation, _, _ = best_rotation(after.T @ before)
+    rotation, singular, handedness = best_rotation(after.T @ before)
     turned = before @ rotation.T
     scale = float((after * turned).sum() / (before**2).sum())
-    return float(np.sqrt(((after - scale * turned) ** 2).sum() / (3 * n - 7))), scale - 1, "model"
+    squares = float(((after - scale * turned) ** 2).sum())
+    if handedness < 0:
+        reflected = float((after**2).sum() - singular.sum() ** 2 / (before**2).sum())
+        if squares > MIRROR_RATIO * max(reflected, LEAST_SHARE * float((after**2).sum())):
+            return np.nan, np.nan, "mirrored"
+    return float(np.sqrt(squares / (3 * n - 7))), scale - 1, "model"

@@ -57,3 +57,11 @@ def test_an_unforeseen_failure_is_a_failed_examination_with_its_trace(tmp_path: 
 def test_a_film_that_vanished_is_unreadable(tmp_path: Path) -> None:
     outcome = measure_task(task("a", tmp_path / "out", tmp_path / "S_a.tif"))
     assert (outcome.status, outcome.reasons) == ("failed", "film-unreadable")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes on this system")
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "S_1.tif"
+    os.mkfifo(pipe)
+    outcome = measure_task(task("1", tmp_path / "out", pipe))
+    assert (outcome.status, outcome.reasons) == ("failed", "film-unreadable")

@@ -226,3 +226,13 @@ def test_the_python_function_does_the_same_and_raises_what_the_command_prints(fo
         rsa_vision.measure(folder, tmp_path / "out", method="bundle")
     with pytest.raises(rsa_vision.RsaError, match="unknown_key"):
         rsa_vision.measure(folder, tmp_path / "out", unknown_key=1)
+
+
+def test_links_in_a_circle_fail_alone_and_the_run_ends_with_its_report(tmp_path: Path) -> None:
+    films = tmp_path / "films"
+    films.mkdir()
+    (films / "S_1_f1.tif").symlink_to(films / "S_1_f1.tif")
+    (films / "S_1_f2.tif").write_bytes(b"")
+    assert run_app(["measure", str(films), "-o", str(tmp_path / "out"), "--cage", "2"]) == 1
+    assert (tmp_path / "out" / "run.json").exists()
+    assert (tmp_path / "out" / "report.html").exists()

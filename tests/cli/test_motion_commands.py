@@ -190,6 +190,7 @@ def test_wrong_usage_is_refused(markers: Path, tmp_path: Path, capsys: pytest.Ca
         (["motion", str(markers), "--side", "front"], "side"),
         (["precision", str(markers)], "no double examination"),
         (["growth", str(markers), "--material", "wood"], "material 'wood' is not known"),
+        (["growth", str(markers), "--temperature-c", "74"], "temperature 74 is none of a room"),
     ):
         assert run_app(arguments) == 2
         assert said in capsys.readouterr().err
@@ -245,6 +246,31 @@ def test_growth_between_two_times_has_stated_errors_that_are_true(markers: Path)
     lengths = read(markers.with_name("lengths.csv")).filter(pl.col("segment_a") == pl.col("segment_b"))
     ratio = (lengths["difference_um"] / lengths["sd_um"]).to_numpy()
     assert 0.9 < np.sqrt((ratio**2).mean()) < 1.1
+
+
+def test_growth_has_no_scale_for_a_mirror_image_and_says_which_markers_stand_twice(
+    markers: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = pl.read_csv(markers)
+    last = table["exam"].unique().sort()[-1]
+    flipped = table.with_columns(x_mm=pl.when(pl.col("exam") == last).then(-pl.col("x_mm")).otherwise("x_mm"))
+    flipped.write_csv(tmp_path / "flipped.csv")
+    assert run_app(["growth", str(tmp_path / "flipped.csv"), "-o", str(tmp_path / "flipped")]) == 1
+    found = read(tmp_path / "flipped" / "growth.csv")
+    mirrored = found.filter(pl.col("exam_to") == str(last))
+    assert set(mirrored["reasons"]) == {"mirrored"}
+    assert mirrored["scale_ppm"].null_count() == mirrored["s0_um"].null_count() == len(mirrored)
+    assert mirrored["rmsv_um"].null_count() == 0  # lengths are the same in a mirror
+    assert set(found.filter(pl.col("exam_to") != str(last))["status"]) == {"ok"}
+    pl.concat([table, table.filter(pl.col("exam") == last).head(1)]).write_csv(tmp_path / "twice.csv")
+    assert run_app(["growth", str(tmp_path / "twice.csv"), "-o", str(tmp_path / "twice")]) == 1
+    assert "review (marker-duplicate)" in capsys.readouterr().out
+
+
+def test_growth_of_points_in_one_place_is_not_determined(markers: Path, tmp_path: Path) -> None:
+    pl.read_csv(markers).with_columns(x_mm=1.0, y_mm=2.0, z_mm=3.0).write_csv(tmp_path / "one.csv")
+    found = rsa_vision.growth(tmp_path / "one.csv").table  # warnings are errors here
+    assert found["scale_ppm"].null_count() == len(found)
 
 
 def test_ten_thousand_motions_take_a_second(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Which films belong together."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,23 @@ def test_a_film_of_another_name_is_a_failed_examination_not_a_guess(tmp_path: Pa
     assert found.problem is not None
     assert found.problem[0] == "film-name"
     assert "file_pattern" in found.problem[1]
+
+
+def test_a_name_that_is_no_utf8_fails_alone_and_can_be_written(tmp_path: Path) -> None:
+    try:
+        (tmp_path / os.fsdecode(b"\xff\xfeX_1_f1.tif")).write_bytes(b"x")
+    except OSError:
+        pytest.skip("this file system has no such names")
+    bad, good = sorted(group(tmp_path, "S_1_f1.tif", "S_1_f2.tif").exams, key=lambda exam: exam.problem is None)
+    assert (good.subject, good.problem) == ("S", None)
+    assert bad.problem is not None
+    assert bad.problem[0] == "film-name"
+    assert bad.subject.encode() == b"\\udcff\\udcfeX_1_f1"
+    assert "rename" in bad.problem[1].encode().decode()
+
+
+def test_figures_that_are_no_numbers_do_not_stop_the_sorting(tmp_path: Path) -> None:
+    assert [exam.subject for exam in group(tmp_path, "5\u00b23_1.tif", "5_1.tif").exams] == ["5", "5\u00b23"]
 
 
 def test_examinations_sort_by_number_and_repeats_follow(tmp_path: Path) -> None:

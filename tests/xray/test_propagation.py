@@ -11,7 +11,7 @@ from exposures import disturbed, expose, exposure, film_from_plane, objects_of, 
 from rsa_vision.cages import Cage, load_cage
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.error_formulas import model_sd
-from rsa_vision.geometry.focus import rays_of
+from rsa_vision.geometry.focus import rays_of, tip_shift
 from rsa_vision.geometry.rays import cross
 from rsa_vision.settings import Limits
 from rsa_vision.types import ImagePoints, Reconstruction
@@ -239,3 +239,23 @@ def test_rays_of_unnamed_images_cross_within_their_sigma() -> None:
         np.testing.assert_allclose(sigma[diagonal, diagonal] * 1000, found.markers.crossing_sd_um, rtol=1e-6)
         ratios.append((crossing / sigma)[diagonal, diagonal])
     assert BAND[0] < np.sqrt(np.mean(np.square(ratios))) < BAND[1]
+
+
+def test_tips_that_are_all_seen_too_far_out_are_within_the_stated_error() -> None:
+    rng = np.random.default_rng(31)
+    cage, foci, objects, _ = exposure("1A", rng)
+    nominal = np.array([mark.xyz for mark in cage.mark])
+    tips = np.array([tip_shift(mark) for mark in cage.mark])
+    assert np.allclose(tips, [0, -0.25, 0])  # stems along y, half widths of 0.25 mm
+    films = {focus: film_from_plane(rng) for focus in foci}
+    tip_error, stated, blind = 0.02, [], []
+    for _ in range(DRAWS):
+        points = with_sd(expose(cage, foci, objects, films, nominal + rng.normal(0, tip_error) * tips), 0.005)
+        points = disturbed(points, 0.005, rng)
+        for error, ratios in ((tip_error, stated), (0.0, blind)):
+            found = reconstruct(points, cage, WIDE, error).markers
+            off = found.position_mm - objects
+            ratios.append(off[:, 1] ** 2 / found.covariance_mm2[:, 1, 1])
+            assert (found.crossing_um < 5 * found.crossing_sd_um).all()  # nothing in the crossings tells
+    assert BAND[0] < np.sqrt(np.mean(stated)) < BAND[1]
+    assert np.sqrt(np.mean(blind)) > 3
