@@ -15,7 +15,7 @@ from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
-LEAST_APART = 0.4  # of the radius: nearer centres cannot be told apart with confidence
+LEAST_APART = 0.7  # of the radius: nearer centres cannot be told apart with confidence, and pass for one place
 LEAST_GAIN = 30.0  # twice the log-likelihood that four parameters more must gain
 _STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
 _SIZES = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
@@ -77,7 +77,7 @@ def _two(pair: BallFits, whole: BallFits, radius: float, depth: float, noise: No
     one_sign = pair.depth[0] * pair.depth[1] > 0
     held = bool((np.hypot(*(pair.position_px - whole.position_px[0]).T) < 2.5 * radius).all())
     # the window of two is larger than that of one: compare what is left under the balls only
-    better = whole.chi2_core[0] - float(pair.chi2_core.mean()) > LEAST_GAIN / (np.pi * radius**2)
+    better = whole.chi2_core[0] - float(pair.chi2_core.mean()) > LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)
     return bool(apart > LEAST_APART * radius and alike.all() and one_sign and held and better and plausible(pair, noise).all())
 
 
