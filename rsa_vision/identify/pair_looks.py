@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import expit, gammaln
 
 from rsa_vision.types import Bool, Float, Int
 
@@ -26,6 +26,7 @@ UNKNOWN: Final = 2.0  # images that look like anything, which are presumed besid
 UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one image, a film's toe), of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
 FAINT: Final = 1e-3  # pairs less probable than that teach nothing
+CLASSES: Final = 3  # of images: clear, disturbed (by a neighbour, an edge, saturation), and not described by the model
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +39,8 @@ class Looks:
         Image of every ray.
     of_ray : ndarray of shape (n, 2)
         Log of apparent radius and of contrast; NaN where unknown.
+    quality : ndarray of int, shape (n,)
+        Class of the image of every ray, below :data:`CLASSES`.
     a, b : ndarray of int, shape (m,)
         The rays of every crossing.
     grown_a, grown_b : ndarray of shape (m,)
@@ -46,6 +49,7 @@ class Looks:
 
     image: Int
     of_ray: Float
+    quality: Int
     a: Int
     b: Int
     grown_a: Float
@@ -108,11 +112,14 @@ class Alone:
     ----------
     log_density : ndarray of shape (n,)
         Of their looks, at that of every ray.
+    log_quality : ndarray of shape (n,)
+        Log likelihood ratio of the class of every ray's image: with a partner, against without.
     hidden : float
         The part of all markers that one focus does not show.
     """
 
     log_density: Float
+    log_quality: Float
     hidden: float
 
 
@@ -134,7 +141,7 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     known = np.isfinite(looks.of_ray[one]).all(axis=1)
     density = np.zeros(len(looks.of_ray))
     if not known.any() or pairs < 0.5:
-        return Alone(density, _hidden(float(single.sum()), pairs))
+        return Alone(density, density.copy(), _hidden(float(single.sum()), pairs))
     sample = looks.of_ray[one[known]]
     middle = _weighted_median(sample, np.ones(len(sample)))
 
@@ -144,9 +151,9 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
 
     of_pairs = np.maximum(paired[one[known]], 1e-9)
     alike = np.array([log_kernels(value, sample, of_pairs, KIND, 2 * pairs) for value in sample])
-    marker = np.ones(len(one))
-    marker[known] = 1 / (1 + np.exp(np.clip(broad(sample) - alike, -50, 50)))
-    hidden = _hidden(float(single @ marker), pairs)
+    odds = np.log(CLASSES * _shares(looks.quality[one], paired[one]))[looks.quality[one]]
+    odds[known] += alike - broad(sample)
+    hidden = _hidden(float(single @ expit(odds)), pairs)
     presumed = hidden * 2 * pairs
     total = float(single.sum()) + presumed + UNKNOWN
     for ray in np.flatnonzero(np.isfinite(looks.of_ray).all(axis=1)):
@@ -158,7 +165,28 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
         if of_others.sum() > 0:
             parts.append(np.log(presumed) + log_kernels(value, sample, of_others, KIND, 2 * pairs))
         density[ray] = np.logaddexp.reduce(parts) - np.log(total)
-    return Alone(density, hidden)
+    return Alone(density, _log_quality(looks, one, paired, presumed), hidden)
+
+
+def _log_quality(looks: Looks, one: Int, paired: Float, presumed: float) -> Float:
+    """Return how much likelier the class of every ray's image is with a partner than without, by the other images.
+
+    Among those without are presumed ones, as for the looks: hidden markers, and some of any class.
+    """
+    result = np.zeros(len(looks.quality))
+    for ray, mine in enumerate(looks.quality):
+        others = one[looks.image[one] != looks.image[ray]]
+        with_partner, single = _shares(looks.quality[others], paired[others]), 1 - paired[others]
+        without = np.bincount(looks.quality[others], single, CLASSES) + presumed * with_partner + UNKNOWN / CLASSES
+        result[ray] = np.log(with_partner[mine] / (without[mine] / without.sum()))
+    return result
+
+
+def _shares(quality: Int, weight: Float) -> Float:
+    """Return the share of every class among images that count by a weight, and one more that is presumed in equal parts."""
+    count = np.bincount(quality, weight, CLASSES) + 1 / CLASSES
+    result: Float = count / count.sum()
+    return result
 
 
 def _hidden(alone: float, pairs: float) -> float:
