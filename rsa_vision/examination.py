@@ -218,8 +218,6 @@ def _pair(
     if slant is not None:  # a ball seen at a slant is an ellipse, longer by 1 / cos: the fitted radius is the geometric mean
         radius_mm = radius_mm * np.sqrt(slant)
     quality = image_quality(table.points.flags[bundle.image])
-    doubtful = quality > 0
-    radius_mm, contrast = np.where(doubtful, np.nan, radius_mm), np.where(doubtful, np.nan, contrast)
     return pair_rays(bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, quality=quality, slack_mm=slack_mm)
 
 
