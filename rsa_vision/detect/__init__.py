@@ -20,7 +20,7 @@ from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import estimate_optics
-from rsa_vision.detect.pins import find_pins, look_for_pins, on_pins, optics_of_pins
+from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
@@ -78,7 +78,7 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     candidates = find_candidates(values, STRENGTH, noise)
     pins = look_for_pins(values, candidates.strokes, noise)
     seeds = first_look(values, candidates, noise)
-    seeds = seeds.rows(~on_pins(seeds.position_px, 1 - seeds.explained, pins))
+    seeds = seeds.rows(~on_pins(seeds.position_px, 1 - seeds.explained, [p for p in pins if is_slim(p)]))
     found = [
         _one_polarity(values, bits, sign, optics, seeds, pins, candidates, noise, false_detections)
         for sign, optics in _polarities(values, seeds, pins, candidates, noise)

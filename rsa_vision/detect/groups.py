@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, polynomial, uneven
+from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut, weighted_least_squares
 from rsa_vision.detect.profiles import ball_table
@@ -74,24 +75,30 @@ def fit_group(
         slope = slope / (sigma_px * np.maximum(rho, 1e-9))
         return value, -slope * dx, -slope * dy, slope_r / sigma_px
 
-    def linear_part(value: Float) -> Float:
-        # of two balls in one beam the second takes from what the first has left, of two exposures on one film each takes its own: how much
-        # of the product of their images is there, the film tells
-        products = [value[i] * value[j] for i, j in lapping(local, radius, sigma_px)]
-        return np.column_stack([*value, surface, *products])
+    def linear_part(value: Float) -> tuple[Float, list[tuple[int, int]], list[Float]]:
+        # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
+        pairs, columns, slopes = [], [], []
+        for pair in lapping(local, radius):
+            product, by = product_image(local[list(pair)], radius[list(pair)], sigma_px, mu_px, patch.size)
+            if product.max() > LEAST:
+                pairs, columns, slopes = [*pairs, pair], [*columns, product], [*slopes, by]
+        return np.column_stack([*value, surface, *columns]), pairs, slopes
 
     value, d_col, d_row, d_radius = model()
-    linear = linear_part(value)
+    linear, pairs, slopes = linear_part(value)
     theta = weighted_least_squares(linear, weight, data, 1e-6)
     if edge:
         bare = (data - value.T @ theta[:k]).reshape(patch.size, patch.size)
         surface = np.column_stack([surface, edge_profile(bare, valid.reshape(bare.shape), sigma_px)])
-        linear = linear_part(value)
+        linear, pairs, slopes = linear_part(value)
         theta = weighted_least_squares(linear, weight, data, 1e-6)
     converged = False
     for step in range(_STEPS + 1):
         depth = theta[:k, None]
-        jac = np.column_stack([*(depth * d_col), *(depth * d_row), *(depth * d_radius), linear])
+        by_shape = depth * np.stack([d_col, d_row, d_radius])
+        for of_product, pair, by in zip(theta[linear.shape[1] - len(pairs) :], pairs, slopes, strict=True):
+            by_shape[:, list(pair)] += of_product * by.transpose(1, 0, 2)
+        jac = np.column_stack([*by_shape.reshape(3 * k, -1), linear])
         residual = data - linear @ theta
         if step == _STEPS or converged:
             break
@@ -104,7 +111,7 @@ def fit_group(
         radius = np.clip(radius + scale * move[2], low, high)
         converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
         value, d_col, d_row, d_radius = model()
-        linear = linear_part(value)
+        linear, pairs, slopes = linear_part(value)
         theta = weighted_least_squares(linear, weight, data, 1e-9)
     covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
     influence = (covariance[: 4 * k] @ (jac * np.sqrt(weight)[:, None]).T).reshape(4 * k, patch.size, patch.size)
@@ -133,14 +140,6 @@ def fit_group(
         background=np.full(k, theta[k]),
         converged=np.full(k, converged),
     )
-
-
-def lapping(local: Float, radius: Float, sigma_px: float) -> list[tuple[int, int]]:
-    """Return the pairs of balls whose images lie over each other, by their places (k, 2) and radii (k,)."""
-    k = len(radius)
-    gap = np.hypot(*(local[:, None] - local[None]).transpose(2, 0, 1))
-    over = gap < radius[:, None] + radius[None] + sigma_px
-    return [(i, j) for i in range(k) for j in range(i) if over[i, j]]
 
 
 def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:

@@ -19,6 +19,7 @@ KAPPA = 0.5  # attenuation along one blur width while the blur is looked for
 KAPPAS = (0.1, 0.25, 0.5, 1.0, 2.0)
 _MOST_TRIED, _MOST_SEEDS = 40, 16
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
+_CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
 _CAP = 50.0  # significance beyond which a ball is no better evidence
 
 
@@ -62,6 +63,12 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     chosen = chosen[closest[chosen] < max(0.08, 1.5 * closest[chosen[0]])]
     position, radius = position[chosen], radius[chosen]
     sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen), s) for s, t in zip(SIGMAS_PX, trials, strict=True)])
+    # what came close at another blur only, as two balls in one at a wide one, is none of the film's balls
+    close = _closeness(fit(sigma, KAPPA), noise)
+    kept = close < max(_CLOSE, _UNLIKE * float(np.sort(close)[len(close) // 4]))
+    if not kept.all():
+        chosen, position, radius = chosen[kept], position[kept], radius[kept]
+        sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen), s) for s, t in zip(SIGMAS_PX, trials, strict=True)])
     kappa = round(refine(KAPPAS, [_cost(fit(sigma, k), sigma) for k in KAPPAS]), 2)
     near = [sigma * f for f in NEAR]
     last = [fit(s, kappa) for s in near]

@@ -15,6 +15,7 @@ from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
+SLIM = 4.5  # length over half the width; two balls side by side have four
 EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters leave more
 BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 _MOST_STROKES = 60
@@ -173,11 +174,16 @@ def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
     return on
 
 
+def is_slim(fit: NeedleFit) -> bool:
+    """Say whether a fit is longer than two balls side by side."""
+    return fit.shape.length_px > SLIM * fit.shape.half_width_px
+
+
 def is_pin(fit: NeedleFit) -> bool:
     """Say whether a fit looks like a pin: little misfit, slim, all of it on the film."""
     if not np.isfinite(fit.misfit) or fit.significance < _SIGNIFICANT or fit.valid_fraction < 0.9:
         return False
-    return bool(fit.shape.length_px > 3.0 * fit.shape.half_width_px and fit.misfit < MISFIT and fit.explained > EXPLAINED)
+    return bool(is_slim(fit) and fit.misfit < MISFIT and fit.explained > EXPLAINED)
 
 
 def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:

@@ -90,7 +90,7 @@ def _fill(polygons: _Polygons, block: Sequence[Segment], pairs: Int, rows: Int) 
         with np.errstate(invalid="ignore", divide="ignore"):
             unit = np.nan_to_num(towards / side[..., None])
         variance = np.einsum("ekca,ekcab,ekcb->kc", unit, errors + np.roll(errors, -1, axis=2), unit)
-        known = np.isfinite(errors).all(axis=(0, 2, 3, 4))
+        known = np.asarray(np.isfinite(errors).all(axis=(0, 2, 3, 4)))
         polygons.corner[row, corners] = True
         polygons.column[row, :size], polygons.ahead[row, :size] = column, np.roll(column, -1, axis=1)
         polygons.side_mm[:, row, :size] = side
