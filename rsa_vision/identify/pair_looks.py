@@ -166,7 +166,9 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     broad = (log_student((value - middle) / np.hypot(WIDE, unsure), 3.0) - np.log(np.hypot(WIDE, unsure))).sum(axis=1)
     shares = _shares(quality, paired[one])
     odds = np.log(CLASSES * shares)[quality]
-    odds[known] += [log_kernels(value[k], value[clear], of_pairs[clear], np.hypot(KIND, unsure[k]), 2 * pairs) for k in np.flatnonzero(known)]
+    odds[known] += [
+        log_kernels(value[k], value[clear], of_pairs[clear], np.hypot(KIND, unsure[k]), 2 * pairs) for k in np.flatnonzero(known)
+    ]
     odds[known] -= broad[known]
     hidden = _hidden(float(single @ expit(odds)), pairs)
     presumed = hidden * 2 * pairs
