@@ -94,7 +94,7 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
     both = np.maximum(weight_a + weight_b, 1e-9)
     mean = (weight_a * np.nan_to_num(first) + weight_b * np.nan_to_num(second)) / both
     unsure = np.hypot(weight_a * unsure_a, weight_b * unsure_b) / both
-    both_looks = np.column_stack([first, second])
+    of_pair = np.column_stack([mean, first - second])
     teachers = np.flatnonzero(known_a & known_b & ~unsure_a.any(axis=1) & ~unsure_b.any(axis=1) & (pair > FAINT))
     result = np.zeros(len(pair))
     for e in np.flatnonzero(known_a | known_b):
@@ -114,8 +114,8 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
             wider = np.hypot(spread * np.sqrt(1 + 1 / n), np.hypot(unsure_a[e], unsure_b[e]))
             marker += float((log_student((first[e] - second[e] - middle) / wider, min(n, 4.0)) - np.log(wider)).sum())
             # where two exposures lap on a film, contrasts come in sorts: as likely, a pair looks like one of the other pairs
-            width = np.hypot([*KIND, *KIND], [*unsure_a[e], *unsure_b[e]])
-            marker = np.logaddexp(marker, log_kernels(both_looks[e], both_looks[free], weight, width, n)) - np.log(2)
+            width = np.hypot([*KIND, *np.minimum(spread, USUAL)], [*unsure[e], *np.hypot(unsure_a[e], unsure_b[e])])
+            marker = np.logaddexp(marker, log_kernels(of_pair[e], of_pair[free], weight, width, n)) - np.log(2)
         like = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
         result[e] = np.logaddexp(np.log1p(-unlike) + like, np.log(unlike))
     return result
