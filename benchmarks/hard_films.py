@@ -20,9 +20,11 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import polars as pl
+from review_cases import Case, review_case, write_page
 
 from rsa_vision.cages import Cage, load_cage
 from rsa_vision.examination import ExaminationResult, measure_examination, name_and_reconstruct
@@ -94,13 +96,16 @@ def render(seed: int, name: str) -> RenderedExamination:
     )
 
 
-def measure(seed: int, name: str, keep: Path | None) -> tuple[ExaminationResult, Truth]:
-    """Render, write, read and measure one examination; with ``keep``, films and detections are kept and used again."""
+def measure(seed: int, name: str, keep: Path | None) -> tuple[ExaminationResult, Truth, list[np.ndarray]]:
+    """Render, write, read and measure one examination; with ``keep``, films and detections are kept and used again.
+
+    The third result is the pixels of the films.
+    """
     study, cage = Study(), load_cage(name)
     kept = keep / f"{name}_{seed}.pickle" if keep else None
     if kept and kept.exists():
         films, truth = pickle.loads(kept.read_bytes())
-        return name_and_reconstruct(films, study, cage), truth
+        return name_and_reconstruct(films, study, cage), truth, [read_film(film.path).values for film in films]
     rendered = render(seed, name)
     truth = Truth(rendered.images, rendered.markers)
     with tempfile.TemporaryDirectory() as folder:
@@ -111,7 +116,7 @@ def measure(seed: int, name: str, keep: Path | None) -> tuple[ExaminationResult,
         result = measure_examination(exposed, study, cage)
     if kept:
         kept.write_bytes(pickle.dumps((result.films, truth)))
-    return result, truth
+    return result, truth, [film.values for film, _ in exposed]
 
 
 def wrong_names(result: ExaminationResult, truth: Truth) -> Iterator[str]:
@@ -186,7 +191,7 @@ def furthest_sigma(result: ExaminationResult, truth: Truth) -> float:
 def run(task: tuple[int, str, Path | None]) -> dict[str, object]:
     """Render, measure and judge one examination."""
     seed, name, keep = task
-    result, truth = measure(seed, name, keep)
+    result, truth, values = measure(seed, name, keep)
     wrong, lost = list(wrong_names(result, truth)), list(not_named(result, truth))
     reasons = result.verdict.reasons
     ok, furthest = result.verdict.status == "ok", furthest_sigma(result, truth)
@@ -206,7 +211,23 @@ def run(task: tuple[int, str, Path | None]) -> dict[str, object]:
         "beyond": ok and furthest > BEYOND_SIGMA,
         "furthest": furthest,
         "detections": max(len(film.images) for film in result.films),
+        "case": review_case(f"cage {name}, seed {seed}", result, values, lambda row: told(result, truth, row)),
     }
+
+
+def told(result: ExaminationResult, truth: Truth, row: int) -> str:
+    """Say what an image shows, and whether the other foci have a detection of the same."""
+    balls = _balls_at(result, truth, row)
+    if not balls:
+        return "no ball"
+    images = truth.images.filter((pl.col("role") == "object") & (pl.col("number") == balls[0]))
+    missing = []
+    files = [film.path.name for film in result.films]
+    for file, focus, col, line in images.select("file", "focus", "col_px", "row_px").rows():
+        here = result.points.position_px[result.points.film == files.index(file)]
+        if not (np.hypot(*(here - [col, line]).T) < NEAR_PX).any():
+            missing.append(f"focus {focus}")
+    return f"ball {balls[0]}" + (f", which was not detected of {' and '.join(missing)}" if missing else "")
 
 
 def summary(name: str, rows: pl.DataFrame) -> dict[str, object]:
@@ -234,27 +255,38 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first examination")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--keep", type=Path, help="keep films and detections here, and use them again")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="stop after the examination that is under way then")
     parser.add_argument("--no-page", action="store_true", help="print only")
     args = parser.parse_args()
     if args.keep:
         args.keep.mkdir(parents=True, exist_ok=True)
     tasks = [(args.seed + k, name, args.keep) for k in range(args.n) for name in CAGES]
-    found = []
+    found: list[dict[str, object]] = []
+    cases: list[Case] = []
+    started = perf_counter()
     with ProcessPoolExecutor(args.jobs) as pool:
         for row in pool.map(run, tasks):
+            case = row.pop("case")
+            cases += [case] if isinstance(case, Case) else []
             found.append(row)
             print({key: value for key, value in row.items() if value not in ("", False)}, flush=True)
+            if perf_counter() - started > 60 * args.minutes:
+                pool.shutdown(wait=False, cancel_futures=True)
+                break
     rows = pl.DataFrame(found)
     table = pl.DataFrame([*(summary(name, rows.filter(pl.col("cage") == name)) for name in CAGES), summary("all", rows)])
     reasons = Counter(code for text in rows["reasons"] for code in text.split(";") if code)
     text = ["# Names on hard films", "", (__doc__ or "").strip(), ""]
-    text += [f"Made by `python benchmarks/hard_films.py --n {args.n} --seed {args.seed}`.", ""]
+    command = f"python benchmarks/hard_films.py --n {args.n} --seed {args.seed}"
+    stopped = "" if len(found) == len(tasks) else f", stopped after {len(found)} of {len(tasks)} examinations"
+    text += [f"Made by `{command}`{stopped}. Some that were sent to review: [pictures](review_cases.md).", ""]
     text += ["| " + " | ".join(table.columns) + " |", "|" + "---|" * len(table.columns)]
     text += ["| " + " | ".join(str(v) for v in row) + " |" for row in table.rows()]
     text += ["", "Reasons (an examination may have several):", "", "| reason | examinations |", "|---|---|"]
     text += [f"| `{code}` | {count} |" for code, count in reasons.most_common()]
     if not args.no_page:
         PAGE.write_text("\n".join([*text, ""]), encoding="utf-8")
+        write_page(cases, len(found), command)
     print("\n".join(text[5:]))
 
 

@@ -280,11 +280,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first examination of each cage")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--timed", type=int, default=20, help="films of each cage whose time is taken")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="stop then; the page says after how many examinations")
     parser.add_argument("--rows", type=Path, help="write what was found of every examination to this CSV file")
     args = parser.parse_args()
     tasks = [(args.seed + k // len(CAGES), CAGES[k % len(CAGES)]) for k in range(args.n)]
     seconds = {name: identification_seconds(name, args.timed, args.seed) for name in CAGES}
     found = []
+    started = time.perf_counter()
     with ProcessPoolExecutor(args.jobs) as pool:
         for row in pool.map(run, tasks, chunksize=5):
             found.append(row)
@@ -292,6 +294,9 @@ def main() -> None:
                 print(row, flush=True)
             if len(found) % max(args.n // 20, 1) == 0:
                 print(f"{len(found)} of {args.n}", flush=True)
+            if time.perf_counter() - started > 60 * args.minutes:
+                pool.shutdown(wait=False, cancel_futures=True)
+                break
     rows = pl.DataFrame(found)
     if args.rows:
         rows.write_csv(args.rows)
@@ -300,7 +305,8 @@ def main() -> None:
     reasons = Counter(code for text in rows.filter(pl.col("suffices"))["reasons"] for code in text.split(";") if code)
     table = pl.DataFrame(lines)
     text = ["# Names at the level of points", "", (__doc__ or "").strip(), ""]
-    text += [f"Made by `python benchmarks/identification.py --n {args.n} --seed {args.seed}`.", ""]
+    stopped = "" if len(found) == args.n else f", stopped after {len(found)} of them"
+    text += [f"Made by `python benchmarks/identification.py --n {args.n} --seed {args.seed}`{stopped}.", ""]
     text += ["| " + " | ".join(table.columns) + " |", "|" + "---|" * len(table.columns)]
     text += ["| " + " | ".join(str(v) for v in row) + " |" for row in table.rows()]
     text += ["", "Reasons where the marks suffice (an examination may have several):", "", "| reason | examinations |", "|---|---|"]

@@ -19,7 +19,7 @@ from rsa_vision.identify.cage import CageIdentification, identify_cage
 from rsa_vision.identify.crossings import Region, cage_region
 from rsa_vision.identify.pairs import Pairing, pair_rays
 from rsa_vision.images import require_pitch
-from rsa_vision.readings import LOOKS_DOUBTFUL, FilmReading, Readings, candidates, joined_rays, lonely_images, name_marks, name_objects
+from rsa_vision.readings import FilmReading, Readings, candidates, image_quality, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Study
 from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
@@ -222,9 +222,8 @@ def _pair(
     radius_mm, contrast = table.radius_px[bundle.image] * scale, table.contrast[bundle.image]
     if slant is not None:  # a ball seen at a slant is an ellipse, longer by 1 / cos: the fitted radius is the geometric mean
         radius_mm = radius_mm * np.sqrt(slant)
-    doubtful = (table.points.flags[bundle.image] & LOOKS_DOUBTFUL) != 0
-    radius_mm, contrast = np.where(doubtful, np.nan, radius_mm), np.where(doubtful, np.nan, contrast)
-    return pair_rays(bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, slack_mm=slack_mm)
+    quality = image_quality(table.points.flags[bundle.image])
+    return pair_rays(bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, quality=quality, slack_mm=slack_mm)
 
 
 def _pair_findings(pairing: Pairing, study: Study) -> list[Finding]:

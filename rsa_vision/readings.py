@@ -164,6 +164,11 @@ def name_objects(named: Readings, table: Readings, bundle: RayBundle, pairing: P
     return named.with_points(replace(joined, flags=joined.flags | flags[every]), every)
 
 
+def image_quality(flags: Int) -> Int:
+    """Return how well images were fitted: 0 clear, 1 disturbed by something beside them, 2 not described by the model of a ball."""
+    return np.where(flags & MarkerFlag.POOR_FIT, 2, np.where(flags & LOOKS_DOUBTFUL, 1, 0)).astype(np.int64)
+
+
 def lonely_images(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[Finding]:
     """Find single images that may be markers that the other focus does not show, or hidden there."""
     paired = np.zeros(len(table.points), bool)

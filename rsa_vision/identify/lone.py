@@ -10,13 +10,12 @@ from typing import Final
 import numpy as np
 from scipy.special import expit, gammaln
 
-from rsa_vision.identify.pair_looks import KIND, WIDE, log_kernels, log_student
+from rsa_vision.identify.pair_looks import KIND, UNSURE, WIDE, log_kernels, log_student
 from rsa_vision.types import Bool, Float
 
 PRESUMED: Final = (0.5, 0.05)  # markers that one focus does not show: that many, and that part of those both show
 FREEDOM: Final = 4.0  # of the places of markers on a film: another bone may lie apart
 LEAST_SPREAD: Final = 0.05  # of the places, as a part of the film's larger side
-UNSURE: Final = np.array([0.2, 0.4])  # error of the logs of size and contrast of an image that overlaps another or fits poorly
 
 
 def chance_of_marker(look: Float, place_px: Float, doubtful: Bool, paired: Bool, shape: tuple[int, int]) -> Float:

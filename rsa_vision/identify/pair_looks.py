@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import expit, gammaln
 
 from rsa_vision.types import Bool, Float, Int
 
@@ -25,7 +25,9 @@ HIDDEN: Final = (0.5, 10.0)  # markers that one focus does not show, of all: a g
 UNKNOWN: Final = 2.0  # images that look like anything, which are presumed beside those at hand
 UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one image, a film's toe), of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
+UNSURE: Final = np.array([0.2, 0.4])  # error of the logs of size and contrast of an image that is not clear
 FAINT: Final = 1e-3  # pairs less probable than that teach nothing
+CLASSES: Final = 3  # of images: clear, disturbed (by a neighbour, an edge, saturation), and not described by the model
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +40,8 @@ class Looks:
         Image of every ray.
     of_ray : ndarray of shape (n, 2)
         Log of apparent radius and of contrast; NaN where unknown.
+    quality : ndarray of int, shape (n,)
+        Class of the image of every ray, below :data:`CLASSES`.
     a, b : ndarray of int, shape (m,)
         The rays of every crossing.
     grown_a, grown_b : ndarray of shape (m,)
@@ -46,10 +50,17 @@ class Looks:
 
     image: Int
     of_ray: Float
+    quality: Int
     a: Int
     b: Int
     grown_a: Float
     grown_b: Float
+
+    @property
+    def unsure(self) -> Float:
+        """Error of the look of every ray, shape (n, 2)."""
+        result: Float = np.where((self.quality > 0)[:, None], UNSURE, 0.0)
+        return result
 
 
 def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
@@ -76,8 +87,15 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
     second[:, 0] += looks.grown_b
     known_a: Bool = np.array(np.isfinite(first).all(axis=1))
     known_b: Bool = np.array(np.isfinite(second).all(axis=1))
-    mean = np.where((known_a & known_b)[:, None], (first + second) / 2, np.where(known_a[:, None], first, second))
-    teachers = np.flatnonzero(known_a & known_b & (pair > FAINT))
+    unsure_a, unsure_b = looks.unsure[looks.a], looks.unsure[looks.b]
+    # what a marker looks like is told by both images, or by the one that is known, or clear
+    weight_a = np.where(known_a, np.where(unsure_a[:, 0] > 0, 1e-3, 1.0), 0.0)[:, None]
+    weight_b = np.where(known_b, np.where(unsure_b[:, 0] > 0, 1e-3, 1.0), 0.0)[:, None]
+    both = np.maximum(weight_a + weight_b, 1e-9)
+    mean = (weight_a * np.nan_to_num(first) + weight_b * np.nan_to_num(second)) / both
+    unsure = np.hypot(weight_a * unsure_a, weight_b * unsure_b) / both
+    of_pair = np.column_stack([mean, first - second])
+    teachers = np.flatnonzero(known_a & known_b & ~unsure_a.any(axis=1) & ~unsure_b.any(axis=1) & (pair > FAINT))
     result = np.zeros(len(pair))
     for e in np.flatnonzero(known_a | known_b):
         free = teachers[(looks.a[teachers] != looks.a[e]) & (looks.b[teachers] != looks.b[e])]
@@ -91,11 +109,14 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
         spread = np.maximum(1.4826 * _weighted_median(deviation, weight), LEAST)
         spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL**2) / (n + USUAL_COUNT))
         unlike = (UNLIKE[0] + weight[(deviation > FAR * spread).any(axis=1)].sum()) / (UNLIKE[1] + n)
-        marker = log_kernels(mean[e], mean[free], weight, np.hypot(KIND, spread / 2), n)
-        like = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
+        marker = log_kernels(mean[e], mean[free], weight, np.hypot(np.hypot(KIND, unsure[e]), spread / 2), n)
         if known_a[e] and known_b[e]:
-            wider = spread * np.sqrt(1 + 1 / n)
-            like += float((log_student((first[e] - second[e] - middle) / wider, min(n, 4.0)) - np.log(wider)).sum())
+            wider = np.hypot(spread * np.sqrt(1 + 1 / n), np.hypot(unsure_a[e], unsure_b[e]))
+            marker += float((log_student((first[e] - second[e] - middle) / wider, min(n, 4.0)) - np.log(wider)).sum())
+            # where two exposures lap on a film, contrasts come in sorts: as likely, a pair looks like one of the other pairs
+            width = np.hypot([*KIND, *np.minimum(spread, USUAL)], [*unsure[e], *np.hypot(unsure_a[e], unsure_b[e])])
+            marker = np.logaddexp(marker, log_kernels(of_pair[e], of_pair[free], weight, width, n)) - np.log(2)
+        like = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
         result[e] = np.logaddexp(np.log1p(-unlike) + like, np.log(unlike))
     return result
 
@@ -108,11 +129,14 @@ class Alone:
     ----------
     log_density : ndarray of shape (n,)
         Of their looks, at that of every ray.
+    log_quality : ndarray of shape (n,)
+        Log likelihood ratio of the class of every ray's image: with a partner, against without.
     hidden : float
         The part of all markers that one focus does not show.
     """
 
     log_density: Float
+    log_quality: Float
     hidden: float
 
 
@@ -131,34 +155,59 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     """
     _, one = np.unique(looks.image, return_index=True)  # on a shared film an image has several rays
     single, pairs = 1 - paired[one], float(paired[one].sum()) / 2
-    known = np.isfinite(looks.of_ray[one]).all(axis=1)
+    quality, value, unsure = looks.quality[one], looks.of_ray[one], looks.unsure[one]
+    known: Bool = np.array(np.isfinite(value).all(axis=1))
+    clear = known & (quality == 0)
     density = np.zeros(len(looks.of_ray))
-    if not known.any() or pairs < 0.5:
-        return Alone(density, _hidden(float(single.sum()), pairs))
-    sample = looks.of_ray[one[known]]
-    middle = _weighted_median(sample, np.ones(len(sample)))
-
-    def broad(value: Float) -> Float:
-        result: Float = (log_student((value - middle) / WIDE, 3.0) - np.log(WIDE)).sum(axis=-1)
-        return result
-
-    of_pairs = np.maximum(paired[one[known]], 1e-9)
-    alike = np.array([log_kernels(value, sample, of_pairs, KIND, 2 * pairs) for value in sample])
-    marker = np.ones(len(one))
-    marker[known] = 1 / (1 + np.exp(np.clip(broad(sample) - alike, -50, 50)))
-    hidden = _hidden(float(single @ marker), pairs)
+    if not clear.any() or pairs < 0.5:
+        return Alone(density, density.copy(), _hidden(float(single.sum()), pairs))
+    middle = _weighted_median(value[clear], np.ones(int(clear.sum())))
+    of_pairs = np.where(clear, np.maximum(paired[one], 1e-9), 0.0)
+    broad = (log_student((value - middle) / np.hypot(WIDE, unsure), 3.0) - np.log(np.hypot(WIDE, unsure))).sum(axis=1)
+    shares = _shares(quality, paired[one])
+    odds = np.log(CLASSES * shares)[quality]
+    odds[known] += [
+        log_kernels(value[k], value[clear], of_pairs[clear], np.hypot(KIND, unsure[k]), 2 * pairs) for k in np.flatnonzero(known)
+    ]
+    odds[known] -= broad[known]
+    hidden = _hidden(float(single @ expit(odds)), pairs)
     presumed = hidden * 2 * pairs
-    total = float(single.sum()) + presumed + UNKNOWN
-    for ray in np.flatnonzero(np.isfinite(looks.of_ray).all(axis=1)):
-        others = looks.image[one[known]] != looks.image[ray]
-        value, w, of_others = looks.of_ray[ray], np.where(others, single[known], 0.0), np.where(others, of_pairs, 0.0)
-        parts = [np.log(UNKNOWN) + broad(value)]
-        if w.sum() > 0:
-            parts.append(np.log(w.sum()) + log_kernels(value, sample, w, KIND, float(w.sum())))
-        if of_others.sum() > 0:
-            parts.append(np.log(presumed) + log_kernels(value, sample, of_others, KIND, 2 * pairs))
-        density[ray] = np.logaddexp.reduce(parts) - np.log(total)
-    return Alone(density, hidden)
+    of_image = np.zeros(len(one))
+    for k in np.flatnonzero(known):  # among those fitted as well as this one, or as badly
+        alike = known & ((quality == 0) == (quality[k] == 0))
+        others, unknown = np.arange(len(one)) != k, UNKNOWN * (1 if quality[k] == 0 else CLASSES - 1) / CLASSES
+        markers = presumed * float(shares[0] if quality[k] == 0 else 1 - shares[0])
+        weights, widths = (np.where(alike & others, single, 0.0), np.where(clear & others, of_pairs, 0.0)), np.hypot(KIND, unsure[k])
+        parts = [np.log(unknown) + broad[k]]
+        if weights[0].sum() > 0:
+            n = float(weights[0].sum())
+            parts.append(np.log(n) + log_kernels(value[k], value[alike], weights[0][alike], np.hypot(widths, unsure[k]), n))
+        if weights[1].sum() > 0:
+            parts.append(np.log(markers) + log_kernels(value[k], value[clear], weights[1][clear], widths, 2 * pairs))
+        of_image[k] = np.logaddexp.reduce(parts) - np.log(weights[0].sum() + markers + unknown)
+    density = of_image[np.searchsorted(looks.image[one], looks.image)]
+    return Alone(density, _log_quality(looks, one, paired, presumed), hidden)
+
+
+def _log_quality(looks: Looks, one: Int, paired: Float, presumed: float) -> Float:
+    """Return how much likelier the class of every ray's image is with a partner than without, by the other images.
+
+    Among those without are presumed ones, as for the looks: hidden markers, and some of any class.
+    """
+    result = np.zeros(len(looks.quality))
+    for ray, mine in enumerate(looks.quality):
+        others = one[looks.image[one] != looks.image[ray]]
+        with_partner, single = _shares(looks.quality[others], paired[others]), 1 - paired[others]
+        without = np.bincount(looks.quality[others], single, CLASSES) + presumed * with_partner + UNKNOWN / CLASSES
+        result[ray] = np.log(with_partner[mine] / (without[mine] / without.sum()))
+    return result
+
+
+def _shares(quality: Int, weight: Float) -> Float:
+    """Return the share of every class among images that count by a weight, and one more that is presumed in equal parts."""
+    count = np.bincount(quality, weight, CLASSES) + 1 / CLASSES
+    result: Float = count / count.sum()
+    return result
 
 
 def _hidden(alone: float, pairs: float) -> float:

@@ -66,6 +66,7 @@ def pair_rays(
     region: Region | None = None,
     radius_mm: Float | None = None,
     contrast: Float | None = None,
+    quality: Int | None = None,
     slack_mm: float | None = None,
 ) -> Pairing:
     """Find the rays that belong to one marker.
@@ -81,6 +82,8 @@ def pair_rays(
     radius_mm : ndarray of shape (n,), optional
         Apparent radius at the ray's ``through_mm``; NaN where unknown.
     contrast : ndarray of shape (n,), optional
+    quality : ndarray of int, shape (n,), optional
+        How well the image was fitted: 0 clear, 1 disturbed, 2 not described by the model; default: all alike.
     slack_mm : float, optional
         Systematic error of the rays; default: estimated from the crossings.
 
@@ -96,15 +99,16 @@ def pair_rays(
     slack = common_error(crossings) if slack_mm is None else slack_mm
     crossings = crossings.with_slack(slack)
     crossings = crossings.rows(crossings.distance_mm < limits.crossing_sigma * crossings.sigma_mm)
-    looks = _looks(bundle, crossings, radius_mm, contrast)
+    looks = _looks(bundle, crossings, radius_mm, contrast, quality)
     foci = len(np.unique(bundle.focus))
     groups, share, membership = _groups(bundle, crossings, foci)
     claims = [tuple(sorted(set(bundle.image[list(group)].tolist()))) for group in groups]
-    look = np.zeros(len(crossings))
+    look, of_quality = np.zeros(len(crossings)), np.zeros(len(bundle))
     prior = 0.5
     packing = Packing(np.zeros(0, bool), np.zeros(0))
     for _ in range(ROUNDS):  # what pairs look like, and how many there are, from the pairs themselves
         gain = share @ crossings.log_ratio() + membership @ look + np.log(prior / (1 - prior)) * (np.array([len(g) for g in groups]) - 1)
+        gain += np.array([of_quality[list(g)].sum() for g in groups])
         packing = pack(claims, gain)
         prior = _fraction(groups, packing, len(images), foci)
         posterior = np.nan_to_num(packing.posterior)
@@ -114,15 +118,16 @@ def pair_rays(
         of_ray = paired[bundle.image].clip(0, 1)
         alone = images_alone(looks, of_ray)
         crossings = crossings.among(neighbours, (1 - of_ray) + alone.hidden * of_ray)
-        look = log_odds_of_looks(looks, posterior @ (membership > 0), alone)
+        look, of_quality = log_odds_of_looks(looks, posterior @ (membership > 0), alone), alone.log_quality
     return _pairing(bundle, crossings, groups, membership, packing, images, limits, slack)
 
 
-def _looks(bundle: RayBundle, crossings: Crossings, radius_mm: Float | None, contrast: Float | None) -> Looks:
+def _looks(bundle: RayBundle, crossings: Crossings, radius_mm: Float | None, contrast: Float | None, quality: Int | None) -> Looks:
     known = [np.full(len(bundle), np.nan) if values is None else values for values in (radius_mm, contrast)]
     with np.errstate(invalid="ignore", divide="ignore"):
         of_ray = np.log(np.stack(known, axis=1))
-    return Looks(bundle.image, of_ray, crossings.a, crossings.b, crossings.grown_a, crossings.grown_b)
+    quality = np.zeros(len(bundle), np.int64) if quality is None else quality
+    return Looks(bundle.image, of_ray, quality, crossings.a, crossings.b, crossings.grown_a, crossings.grown_b)
 
 
 def _groups(bundle: RayBundle, crossings: Crossings, foci: int) -> tuple[list[tuple[int, ...]], Float, Float]:

@@ -179,6 +179,43 @@ def test_twins_in_one_epipolar_plane_are_told_by_size_or_doubted() -> None:
     assert decided > 0
 
 
+def counts(rays: Rays, pairing: Pairing) -> np.ndarray:
+    """Markers that are named without doubt: (rightly, wrongly)."""
+    sure = [rays.right(group) for group, doubted in zip(pairing.groups, pairing.ambiguous, strict=True) if not doubted]
+    return np.array([sum(sure), len(sure) - sum(sure)])
+
+
+def test_images_that_no_ball_describes_make_no_marker_doubtful() -> None:
+    """Threads of screws among the markers: that they were fitted badly is told, and fewer markers are doubted for them."""
+    told, untold = np.zeros(2), np.zeros(2)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        rays = rays_to(some_markers(13, rng), rng, sd_mm=0.01, hidden=1, false=20)
+        rays.radius_mm[:], rays.contrast[:] = (
+            0.4 * np.exp(rng.normal(0, 0.2, len(rays.bundle))),
+            0.3 * np.exp(rng.normal(0, 0.4, len(rays.bundle))),
+        )
+        false = np.array([rays.marker[image][1] < 0 for image in rays.bundle.image])
+        told += counts(rays, rays.pair(quality=np.where(false, 2, 0)))
+        untold += counts(rays, rays.pair())
+    assert told[0] > untold[0] + 10
+    assert told[1] == 0
+
+
+def test_contrasts_of_several_sorts_are_no_doubt() -> None:
+    """Two exposures that lap on one film: a ball's contrast is a quarter of another's in one image, in the other, or in both."""
+    named = np.zeros(2)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        rays = rays_to(some_markers(14, rng), rng, sd_mm=0.006, hidden=1)
+        focus, marker = np.array([rays.marker[image] for image in rays.bundle.image]).T
+        faint = (marker % 3 == 2) | (marker % 3 == focus - 1)
+        rays.contrast[faint] /= 4
+        named += counts(rays, rays.pair())
+    assert named[0] >= 0.9 * 8 * 12
+    assert named[1] == 0
+
+
 def test_a_lone_mediocre_crossing_is_doubted() -> None:
     rng = np.random.default_rng(0)
     rays = rays_to(np.array([[0.0, 100.0, 60.0]]), rng, shared=False, sd_mm=0.1, false=4)
