@@ -336,7 +336,7 @@ def test_continuous_migration_is_told_of_motions_that_are_ok_alone(tmp_path: Pat
     rng = np.random.default_rng(6)
     exams = {"202601010900": "20240101", "202602010900": "20250101", "202603010900": "20260101"}
     bodies = subject(rng, exams=3, segments=("bone", "stem"), markers=5, angle_deg=0, shift_mm=0)
-    bodies.shift[1, "stem"][1], bodies.shift[2, "stem"][1] = -0.5, -1.0
+    bodies.shift[1, "stem"][1], bodies.shift[2, "stem"][1] = -1.0, -2.5
     path = write(tmp_path / "markers.csv", [bodies], rng, exams)
 
     def told() -> dict[tuple[str, str], bool | None]:
