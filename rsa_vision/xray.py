@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -22,6 +22,7 @@ __all__ = [
     "FocusFit",
     "calibration_error",
     "check_controls",
+    "crossing_factor",
     "rays_of",
     "reconstruct",
     "reconstruct_calibrated",
@@ -30,8 +31,8 @@ __all__ = [
 
 DERIVED = MarkerFlag.REJECTED | MarkerFlag.LARGE_RESIDUAL | MarkerFlag.ONE_VIEW | MarkerFlag.NO_COVARIANCE  # set anew here
 
-_LEAST_FOR_CALIBRATION = 5  # markers that can tell an error of the calibration
-_CALIBRATION_P = 0.01  # significance from which crossing errors count as larger than the images explain
+_LEAST_FOR_CROSSINGS = 5  # markers that can tell an error of all
+_UNEXPLAINED_P = 0.01  # significance from which crossing errors count as larger than the images explain
 _MEDIAN_CHI2 = 0.455  # of one degree of freedom
 
 Groups = dict[str, list[int]]
@@ -78,6 +79,7 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits, tip_error: floa
         bundles.append(rays_of(points.position_px[rows], points.covariance_px2[rows], fit.solution, cage, rows, fit.focus_by_image))
     bundle = _joined(bundles)
     markers, distance, flags = _intersect(_object_groups(points, bundle), bundle, flags, limits)
+    markers = replace(markers, covariance_mm2=markers.covariance_mm2 * crossing_factor(markers) ** 2)
     objects = points.role == "object"
     residual[objects] = distance[objects]
     used |= objects & np.isfinite(distance)
@@ -161,13 +163,34 @@ def calibration_error(markers_at: Callable[[float], Markers]) -> float:
         return known
 
     exact = ratios(0.0)
-    if len(exact) < _LEAST_FOR_CALIBRATION or chdtrc(len(exact), exact.sum()) > _CALIBRATION_P:
+    if len(exact) < _LEAST_FOR_CROSSINGS or chdtrc(len(exact), exact.sum()) > _UNEXPLAINED_P:
         return 0.0
     low, high = 1e-3, 30.0
     for _ in range(30):
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if np.median(ratios(middle)) > _MEDIAN_CHI2 else (low, middle)
     return float(np.sqrt(low * high)) if low > 1e-3 else 0.0
+
+
+def crossing_factor(markers: Markers) -> float:
+    """Return the factor by which the crossing errors show the markers' standard deviations to be too small.
+
+    Parameters
+    ----------
+    markers : Markers
+
+    Returns
+    -------
+    float
+        1 where the stated errors explain the crossings (chi-square, p > 0.01) or fewer than five markers could tell; else the root of the
+        median of the squared ratios of crossing errors and their standard deviations, against that of chi-square: single wrong pairs,
+        which their own crossing errors show, leave the others alone.
+    """
+    squares = (markers.crossing_um / markers.crossing_sd_um) ** 2
+    squares = squares[np.isfinite(squares)]
+    if len(squares) < _LEAST_FOR_CROSSINGS or chdtrc(len(squares), squares.sum()) > _UNEXPLAINED_P:
+        return 1.0
+    return max(float(np.sqrt(np.median(squares) / _MEDIAN_CHI2)), 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

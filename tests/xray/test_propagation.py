@@ -15,7 +15,7 @@ from rsa_vision.geometry.focus import rays_of, tip_shift
 from rsa_vision.geometry.rays import cross
 from rsa_vision.settings import Limits
 from rsa_vision.types import ImagePoints, Reconstruction
-from rsa_vision.xray import reconstruct
+from rsa_vision.xray import crossing_factor, reconstruct
 
 WIDE = Limits(fiducial_um=1e6, line_mm=1e6)  # no gross-error rule: it would cut the tails of drawn errors
 LINEAR = 2e-4  # relative, at exact points
@@ -259,3 +259,19 @@ def test_tips_that_are_all_seen_too_far_out_are_within_the_stated_error() -> Non
             assert (found.crossing_um < 5 * found.crossing_sd_um).all()  # nothing in the crossings tells
     assert BAND[0] < np.sqrt(np.mean(stated)) < BAND[1]
     assert np.sqrt(np.mean(blind)) > 3
+
+
+def test_crossings_tell_of_errors_that_the_cage_does_not_show() -> None:
+    rng = np.random.default_rng(31)
+    cage, _, objects, points = exposure("1A", rng)
+    ours = points.role == "object"
+    ratios = []
+    for _ in range(40):
+        sd = np.where(ours, 0.2, 0.05)[:, None]
+        shaken = replace(points, position_px=points.position_px + sd * rng.standard_normal(points.position_px.shape))
+        found = reconstruct(with_sd(shaken, 0.05), cage, WIDE)
+        assert all(focus.fiducial_birge < 2 for focus in found.foci)
+        error = found.markers.position_mm - objects
+        ratios.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.markers.covariance_mm2), error) / 3)
+        assert crossing_factor(found.markers) > 1
+    assert 0.8 < np.sqrt(np.mean(ratios)) < 1.3
