@@ -22,9 +22,11 @@ lint: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html
 
-bench: $(STAMP)  ## long: marker images against the bound, rendered films against the truth
+bench: $(STAMP)  ## hours: marker images against the bound, whole examinations and names against the truth
 	$(BIN)/python benchmarks/detection.py
 	$(BIN)/python benchmarks/reach.py
+	$(BIN)/python benchmarks/identification.py
+	$(BIN)/python benchmarks/hard_films.py
 
 lock:  ## renew requirements.lock (hashes, no addresses)
 	$(PYTHON) -m venv $(VENV)-lock
