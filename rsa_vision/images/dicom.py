@@ -63,11 +63,13 @@ def header(path: Path) -> Header:
     frames = int(ds.get("NumberOfFrames") or 1)
     if frames != 1:
         raise FilmFormatError(f"{path}: a stack of {frames} frames; export one film a file")
-    stored = int(ds.get("BitsStored") or allocated)
-    if allocated not in (8, 16) or stored > allocated:
+    stored = int(ds.get("BitsStored", allocated))
+    if allocated not in (8, 16) or not 0 < stored <= allocated:
         raise FilmFormatError(f"{path}: {stored} bits stored in {allocated}; films have 8 to 16 bits: export it again as 16-bit grey")
     meta = {name: text for name, keywords in _META.items() if (text := _text(ds, keywords))}
     meta["transfer_syntax"] = _transfer_syntax(ds)
+    if meta.get("photometric") == "PALETTE COLOR":  # its values are places in a table
+        raise FilmFormatError(f"{path}: a colour image (PALETTE COLOR); export it again as MONOCHROME2")
     return Header(path, "DICOM", rows, cols, stored, int(ds.get("SamplesPerPixel") or 1), *_pitch(ds), meta)
 
 
@@ -121,8 +123,6 @@ def _decoded(ds: Any, header: Header) -> NDArray[Any]:
     syntax, path = header.meta["transfer_syntax"], header.path
     if syntax not in (*_JPEG, *_JPEG2000, _RLE):
         raise FilmFormatError(f"{path}: transfer syntax {syntax} is not supported; export it again uncompressed")
-    if header.meta.get("photometric") == "PALETTE COLOR":
-        raise FilmFormatError(f"{path}: a colour image (PALETTE COLOR); export it again as MONOCHROME2")
     if syntax != _RLE:
         coded = get_frame(ds.PixelData, 0, number_of_frames=1)
         stream = jpeg_stream(coded) if syntax in _JPEG else jpeg2000_stream(coded)

@@ -342,3 +342,13 @@ def test_require_pitch(tmp_path: Path) -> None:
     assert require_pitch(film, 0.2) == (0.2, 0.2)
     with pytest.raises(PitchError, match="implausible"):
         require_pitch(film, 2.0)
+
+
+def test_dicom_of_a_palette_or_of_no_bits(tmp_path: Path) -> None:
+    values = films.radiograph(12)
+    refused(films.dicom(tmp_path / "palette.dcm", values, 12, photometric="PALETTE COLOR"), FilmFormatError, "PALETTE COLOR")
+    path = films.dicom(tmp_path / "none.dcm", values, 12)
+    ds = pydicom.dcmread(path)
+    ds.BitsStored = 0
+    ds.save_as(path)
+    refused(path, FilmFormatError, "0 bits")
