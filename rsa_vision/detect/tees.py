@@ -22,6 +22,7 @@ ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
 _MOST_JUNCTIONS = 80
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
+_FAINTEST = 0.05  # of the depth of the film's clearest tee: a film linear in exposure has little of it behind thick tissue
 _NEAREST_PX = 3.0  # two tips nearer than this are one
 _MOST_PARALLEL = 24  # of those, the ones looked at
 _OUTLYING = 3.0  # standard deviations from which a direction is an error
@@ -169,7 +170,7 @@ def _peeled(film: NDArray[Any], starts: list[NeedleFit], optics: Optics, noise: 
         in_vain += 1
         others = others_beside(start, kept, optics, ends=True)
         fit = fit_crossing(film, [start], optics, noise, others=others, steps=3)[0]
-        deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > 0.3 * abs(start.depth)
+        deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > _FAINTEST * abs(start.depth)
         near = np.hypot(*(fit.position_px - start.position_px)) < 2 * _NEAREST_PX
         if deep and near and is_tee(fit, slack=ROUGH) and all(np.hypot(*(k.position_px - fit.position_px)) > _NEAREST_PX for k in kept):
             kept.append(fit)
@@ -180,7 +181,7 @@ def _peeled(film: NDArray[Any], starts: list[NeedleFit], optics: Optics, noise: 
 def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
     for fit in sorted(tees, key=lambda f: f.misfit + 1 - f.explained):
-        deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > 0.25 * abs(model.depth)
+        deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > _FAINTEST * abs(model.depth)
         if deep and is_tee(fit, slack=ROUGH) and all(np.hypot(*(fit.position_px - k.position_px)) > _NEAREST_PX for k in kept):
             kept.append(fit)
     return kept
