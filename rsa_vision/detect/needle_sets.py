@@ -27,7 +27,7 @@ _BENDS = (0.6, 0.85, 0.95, 0.985, 0.999)
 _BENT_ATTENUATIONS = (0.35, 0.8)  # per pixel
 _STEP = 0.1  # of the logarithms of attenuation and blur, for derivatives
 _WORST = 5.0  # steps that attenuation and blur may be off at the worst
-_SAMPLE = 6
+_SAMPLE = 18  # arms that are asked for their optics
 _ROUNDS = 2
 
 
@@ -154,12 +154,14 @@ def with_error_of_optics(film: NDArray[Any], needles: list[NeedleFit], optics: O
 
 def _cost(film: NDArray[Any], needles: list[NeedleFit], noise: NoiseModel) -> Callable[[Optics], float]:
     alone = [c[0] for c in clusters(needles) if len(c) == 1] or needles
-    sample = sorted(alone, key=lambda f: f.misfit)[:_SAMPLE]
+    sample = sorted(alone, key=lambda f: f.misfit)
+    sample = sample[: _SAMPLE // len(sample[0].angles)]
 
     def cost(trial: Optics) -> float:
         beside = [others_beside(t, [o for o in needles if o is not t], trial, ends=False) for t in sample]
         fits = [fit_crossing(film, [t], trial, noise, others=o, ends=False)[0] for t, o in zip(sample, beside, strict=True)]
-        return float(sum(f.n_core * np.log(max(f.chi2_core, 0.05)) for f in fits))
+        # the same number of pixels for every trial: a model that calls more of them its own is none the better
+        return float(sum(t.n_core * np.log(max(f.chi2_core, 0.05)) for t, f in zip(sample, fits, strict=True)))
 
     return cost
 

@@ -30,6 +30,7 @@ _POINT = 0.05  # of the half width: no point is a cone to more than that
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
 _OF_A_KIND = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
 _SAMPLE = 6
+_MOST_ASKED = 18  # for the optics that they have in common
 _CLOSE_FIT = 0.03  # misfit and what is not explained, of a pin whose taper is right
 
 
@@ -99,7 +100,8 @@ def find_pins(
     if not any(is_pin(f) for f in sample):
         return [], optics
     optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
-    optics = common_optics(film, [f for f in sample if is_pin(f)], optics, noise)
+    more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
+    optics = common_optics(film, [f for f in sample + more if is_pin(f)], optics, noise)
     sample = [_refit(film, f, optics, noise) for f in sample if is_pin(f)]
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
