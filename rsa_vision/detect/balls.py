@@ -82,7 +82,7 @@ def half_size(radius_px: float, sigma_px: float) -> int:
 def polynomial(axis_scale: float, dx: Float, dy: Float) -> Float:
     """Return the six monomials of a quadratic surface on a new last axis, scaled to about one at the rim of the window."""
     u, v = dx / axis_scale, dy / axis_scale
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    return np.moveaxis(np.array([np.ones_like(u), u, v, u * u, u * v, v * v]), 0, -1)  # each in one piece in memory
 
 
 def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, sigma_px: float, mu_px: float) -> Float:

@@ -89,8 +89,8 @@ class BallTable:
         out = []
         for table in (self.value, self.d_rho, self.d_radius):
             line = (table[top] * (1 - frac) + table[top + 1] * frac).ravel()
-            low = line[index]
-            out.append(low + part * (line[index + 1] - low))
+            # differences between neighbours along rho, so that every pixel takes two values from the same place
+            out.append(line.take(index) + part * np.diff(line, append=0.0).take(index))
         return out[0], out[1], out[2]
 
 
