@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import make_interp_spline
 from scipy.special import i0e
 
 from rsa_vision.types import Float
@@ -107,6 +107,37 @@ def ball_table(mu_sigma: float) -> BallTable:
     -------
     BallTable
     """
+    blur = _blur()
+    opacity = -np.expm1(-2 * mu_sigma * blur.half_chord)
+    coarse = np.matmul(blur.kernel, (opacity * blur.weight)[:, :, None])[:, :, 0]
+    of_y, by_y = blur.along_y
+    of_x, by_x = blur.along_x
+    return BallTable(of_y @ coarse @ of_x.T, of_y @ coarse @ by_x.T, by_y @ coarse @ of_x.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Blur:
+    """What the tables of all attenuations share.
+
+    Attributes
+    ----------
+    half_chord, weight : ndarray of shape (k, 40)
+        Half the chord at the nodes of a quadrature, and their weights in it, for ``k`` radii.
+    kernel : ndarray of shape (k, m, 40)
+        Blurred image of a ring, at ``m`` distances.
+    along_y, along_x : tuple of two ndarrays, of shapes (ny, k) and (nx, m)
+        Cubic spline from the coarse to the fine grid, and its derivative.
+    """
+
+    half_chord: Float
+    weight: Float
+    kernel: Float
+    along_y: tuple[Float, Float]
+    along_x: tuple[Float, Float]
+
+
+@lru_cache(maxsize=1)
+def _blur() -> _Blur:
     log_y = np.arange(np.log(_Y_MIN), np.log(_Y_MAX) + _Y_STEP, _Y_STEP)
     coarse_log_y = np.linspace(log_y[0], log_y[-1], 100)
     x = np.arange(0.0, _Y_MAX + REACH, _X_STEP)
@@ -114,12 +145,9 @@ def ball_table(mu_sigma: float) -> BallTable:
     y = np.exp(coarse_log_y)
     # t = y sin(a): the square root at the rim becomes smooth, so that few nodes suffice
     angle = (_NODES + 1) * np.pi / 4
-    t = y[:, None] * np.sin(angle)
-    opacity = -np.expm1(-2 * mu_sigma * y[:, None] * np.cos(angle))
-    weight = opacity * t * y[:, None] * np.cos(angle) * _WEIGHTS * np.pi / 4
+    t, half_chord = y[:, None] * np.sin(angle), y[:, None] * np.cos(angle)
     rho = coarse_x[None, :, None]
     kernel = np.exp(-0.5 * (rho - t[:, None, :]) ** 2) * i0e(rho * t[:, None, :])
-    coarse = np.einsum("yxk,yk->yx", kernel, weight)
-    spline = RectBivariateSpline(coarse_log_y, coarse_x, coarse)
-    d_radius = spline(log_y, x, dx=1) / np.exp(log_y)[:, None]
-    return BallTable(spline(log_y, x), spline(log_y, x, dy=1), d_radius)
+    along_y, along_x = (make_interp_spline(coarse, np.eye(len(coarse))) for coarse in (coarse_log_y, coarse_x))
+    by_y = along_y(log_y, 1) / np.exp(log_y)[:, None]
+    return _Blur(half_chord, t * half_chord * _WEIGHTS * np.pi / 4, kernel, (along_y(log_y), by_y), (along_x(x), along_x(x, 1)))
