@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 from scipy.special import i0e
 
 from rsa_vision.types import Float
@@ -148,6 +147,28 @@ def _blur() -> _Blur:
     t, half_chord = y[:, None] * np.sin(angle), y[:, None] * np.cos(angle)
     rho = coarse_x[None, :, None]
     kernel = np.exp(-0.5 * (rho - t[:, None, :]) ** 2) * i0e(rho * t[:, None, :])
-    along_y, along_x = (make_interp_spline(coarse, np.eye(len(coarse))) for coarse in (coarse_log_y, coarse_x))
-    by_y = along_y(log_y, 1) / np.exp(log_y)[:, None]
-    return _Blur(half_chord, t * half_chord * _WEIGHTS * np.pi / 4, kernel, (along_y(log_y), by_y), (along_x(x), along_x(x, 1)))
+    of_y, by_log_y = _interpolation(coarse_log_y, log_y)
+    by_y = by_log_y / np.exp(log_y)[:, None]
+    return _Blur(half_chord, t * half_chord * _WEIGHTS * np.pi / 4, kernel, (of_y, by_y), _interpolation(coarse_x, x))
+
+
+def _interpolation(nodes: Float, at: Float) -> tuple[Float, Float]:
+    """Return the matrices that make, of values at evenly spaced nodes (n,), those of their cubic spline and its slopes, shape (m, n).
+
+    No knots at the second node and the last but one, as no slopes at the ends are known (de Boor, A Practical Guide to Splines, 1978).
+    """
+    n, step = len(nodes), nodes[1] - nodes[0]
+    centre = np.arange(-1, n + 1)
+
+    def basis(t: Float) -> tuple[Float, Float]:
+        apart = t[:, None] - centre
+        far = np.maximum(2 - np.abs(apart), 0.0)
+        near = np.maximum(1 - np.abs(apart), 0.0)
+        return far**3 / 6 - 4 * near**3 / 6, np.sign(apart) * (2 * near**2 - far**2 / 2)
+
+    conditions = np.zeros((n + 2, n + 2))
+    conditions[:n] = basis(np.arange(n))[0]
+    conditions[n, :5] = conditions[n + 1, -5:] = 1, -4, 6, -4, 1  # the third derivative does not jump
+    coefficients = np.linalg.inv(conditions)[:, :n]
+    value, slope = basis((at - nodes[0]) / step)
+    return value @ coefficients, slope @ coefficients / step
