@@ -54,13 +54,11 @@ class BallTable:
 
     Attributes
     ----------
-    value, d_rho, d_radius : ndarray of shape (ny, nx)
+    nodes : ndarray of shape (3, ny, nx)
         Opacity (0..1), and its derivatives by rho/sigma and by r/sigma.
     """
 
-    value: Float
-    d_rho: Float
-    d_radius: Float
+    nodes: Float
 
     def evaluate(self, x: Float, y: Float) -> tuple[Float, Float, Float]:
         """Interpolate the table bilinearly.
@@ -76,7 +74,7 @@ class BallTable:
         -------
         value, d_rho, d_radius : ndarrays of the shape of ``x``
         """
-        ny, nx = self.value.shape
+        _, ny, nx = self.nodes.shape
         row = np.clip((np.log(y) - np.log(_Y_MIN)) / _Y_STEP, 0, ny - 1.001)
         top = row.astype(np.intp)
         frac = (row - top)[:, None]
@@ -84,13 +82,12 @@ class BallTable:
         col = np.minimum(x / _X_STEP, nx - 1.001)
         left = col.astype(np.intp)
         part = col - left
-        index = left + (np.arange(len(y)) * nx).reshape((-1,) + (1,) * (x.ndim - 1))
-        out = []
-        for table in (self.value, self.d_rho, self.d_radius):
-            line = (table[top] * (1 - frac) + table[top + 1] * frac).ravel()
-            # differences between neighbours along rho, so that every pixel takes two values from the same place
-            out.append(line.take(index) + part * np.diff(line, append=0.0).take(index))
-        return out[0], out[1], out[2]
+        reach = int(left.max(initial=0)) + 2
+        line = (self.nodes[:, top, :reach] * (1 - frac) + self.nodes[:, top + 1, :reach] * frac).reshape(3, -1)
+        index = left + (np.arange(len(y)) * reach).reshape((-1,) + (1,) * (x.ndim - 1))
+        low = line.take(index, axis=1)
+        value, d_rho, d_radius = low + part * (line.take(index + 1, axis=1) - low)
+        return value, d_rho, d_radius
 
 
 @lru_cache(maxsize=64)
@@ -111,7 +108,7 @@ def ball_table(mu_sigma: float) -> BallTable:
     coarse = np.matmul(blur.kernel, (opacity * blur.weight)[:, :, None])[:, :, 0]
     of_y, by_y = blur.along_y
     of_x, by_x = blur.along_x
-    return BallTable(of_y @ coarse @ of_x.T, of_y @ coarse @ by_x.T, by_y @ coarse @ of_x.T)
+    return BallTable(np.array([of_y @ coarse @ of_x.T, of_y @ coarse @ by_x.T, by_y @ coarse @ of_x.T]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
