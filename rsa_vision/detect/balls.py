@@ -82,7 +82,7 @@ def half_size(radius_px: float, sigma_px: float) -> int:
 def polynomial(axis_scale: float, dx: Float, dy: Float) -> Float:
     """Return the six monomials of a quadratic surface on a new last axis, scaled to about one at the rim of the window."""
     u, v = dx / axis_scale, dy / axis_scale
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    return np.moveaxis(np.array([np.ones_like(u), u, v, u * u, u * v, v * v]), 0, -1)  # each in one piece in memory
 
 
 def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, sigma_px: float, mu_px: float) -> Float:
@@ -172,19 +172,19 @@ def _fit_batch(
     low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px, half - sigma_px)
     radius = np.clip(start_radius_px, low, high)
     weight = valid / noise.variance_at(patches.values.reshape(n, -1).mean(1))[:, None]
-    jac = np.empty((n, len(grid_c), 10))
-    jac[:, :, 4:] = surface
+    jac = np.empty((n, 10, len(grid_c)))  # derivatives by col, row, radius, depth and the background's coefficients
+    jac[:, 4:] = surface.T
     theta = np.zeros((n, 7))
     converged = np.zeros(n, bool)
     model = data
     for step in range(4 if quick else _STEPS):
         value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px)
-        jac[:, :, 3] = value
+        jac[:, 3] = value
         if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
-            theta = _solve(jac[:, :, 3:], weight, data)
+            theta = _solve(jac[:, 3:], weight, data)
         depth = theta[:, :1]
-        jac[:, :, 0], jac[:, :, 1], jac[:, :, 2] = -depth * dx, -depth * dy, depth * slope_r
-        model = np.matmul(jac[:, :, 3:], theta[:, :, None])[:, :, 0]
+        jac[:, 0], jac[:, 1], jac[:, 2] = -depth * dx, -depth * dy, depth * slope_r
+        model = np.matmul(theta[:, None], jac[:, 3:])[:, 0]
         if step in (2, 5):  # the variance follows the expected value once the model is near
             weight = valid / noise.variance_at(model if added is None else model + added)
         delta = _solve(jac, weight, data - model, damping=1e-6)
@@ -196,15 +196,15 @@ def _fit_batch(
         if (np.abs(delta[:, :3]) < _CONVERGED_PX).all():
             break
     value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px)
-    jac[:, :, 3] = value
-    theta = _solve(jac[:, :, 3:], weight, data)
+    jac[:, 3] = value
+    theta = _solve(jac[:, 3:], weight, data)
     depth = theta[:, :1]
-    jac[:, :, 0], jac[:, :, 1], jac[:, :, 2] = -depth * dx, -depth * dy, depth * slope_r
-    residual = data - np.einsum("npk,nk->np", jac[:, :, 3:], theta)
-    weighted = jac * weight[:, :, None]
-    covariance = np.linalg.pinv(np.matmul(weighted.transpose(0, 2, 1), jac), hermitian=True)[:, :4]
+    jac[:, 0], jac[:, 1], jac[:, 2] = -depth * dx, -depth * dy, depth * slope_r
+    residual = data - np.matmul(theta[:, None], jac[:, 3:])[:, 0]
+    weighted = jac * np.sqrt(weight)[:, None]
+    covariance = np.linalg.pinv(np.matmul(weighted, weighted.transpose(0, 2, 1)), hermitian=True)[:, :4]
     if not quick:
-        influence = np.matmul(covariance, (jac * np.sqrt(weight)[:, :, None]).transpose(0, 2, 1)).reshape(n, 4, size, size)
+        influence = np.matmul(covariance, weighted).reshape(n, 4, size, size)
         covariance = np.stack([influence_covariance(one, noise.correlation) for one in influence])
     distance = np.hypot(grid_c - local[:, :1], grid_r - local[:, 1:])
     core = distance < (radius + sigma_px)[:, None]
@@ -266,11 +266,12 @@ def _ball(
 
 
 def _solve(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
-    weighted = jac * weight[:, :, None]
-    normal = np.matmul(weighted.transpose(0, 2, 1), jac)
-    right = np.matmul(weighted.transpose(0, 2, 1), target[:, :, None])[:, :, 0]
+    root = np.sqrt(weight)
+    weighted = jac * root[:, None]
+    normal = np.matmul(weighted, weighted.transpose(0, 2, 1))
+    right = np.matmul(weighted, (root * target)[:, :, None])[:, :, 0]
     scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
-    normal = normal / (scale[:, :, None] * scale[:, None, :])
-    normal[:, np.arange(jac.shape[2]), np.arange(jac.shape[2])] += damping
+    normal /= scale[:, :, None] * scale[:, None, :]
+    normal[:, np.arange(jac.shape[1]), np.arange(jac.shape[1])] += damping
     solution: Float = np.linalg.solve(normal, (right / scale)[:, :, None])[:, :, 0] / scale
     return solution

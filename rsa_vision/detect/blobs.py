@@ -54,6 +54,7 @@ def split_blobs(
     radius, depth = float(np.median(balls.radius_px)), float(np.median(np.abs(balls.depth)))
     size = blobs.radius_px / radius
     worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (np.abs(blobs.depth) > 0.4 * depth) & (blobs.explained > 0.6)
+    least = LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)
     out: list[BallFits] = []
     for i in np.nonzero(worth)[0][:_MOST]:
         place = blobs.position_px[i]
@@ -61,23 +62,25 @@ def split_blobs(
             continue
         others = beside()
         whole = fit_group(film, place[None], blobs.radius_px[[i]], optics.sigma_px, optics.mu_px, noise, others)
+        if whole.chi2_core[0] <= least:
+            continue  # even two that left nothing would not be better by enough
         axis = _long_axis(film, whole, np.sign(blobs.depth[i]))
         for stretch in _STRETCH:
             starts = whole.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
             pair = fit_group(film, starts, np.full(2, radius), optics.sigma_px, optics.mu_px, noise, others)
-            if _two(pair, whole, radius, depth, noise):
+            if _two(pair, whole, radius, depth, least, noise):
                 out.append(pair)
                 break
     return out
 
 
-def _two(pair: BallFits, whole: BallFits, radius: float, depth: float, noise: NoiseModel) -> bool:
+def _two(pair: BallFits, whole: BallFits, radius: float, depth: float, least: float, noise: NoiseModel) -> bool:
     apart = float(np.hypot(*(pair.position_px[1] - pair.position_px[0])))
     alike = (np.abs(np.log(pair.radius_px / radius)) < 0.3) & (np.abs(pair.depth) > 0.4 * depth) & (np.abs(pair.depth) < 2.5 * depth)
     one_sign = pair.depth[0] * pair.depth[1] > 0
     held = bool((np.hypot(*(pair.position_px - whole.position_px[0]).T) < 2.5 * radius).all())
     # the window of two is larger than that of one: compare what is left under the balls only
-    better = whole.chi2_core[0] - float(pair.chi2_core.mean()) > LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)
+    better = whole.chi2_core[0] - float(pair.chi2_core.mean()) > least
     return bool(apart > LEAST_APART * radius and alike.all() and one_sign and held and better and plausible(pair, noise).all())
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import polynomial
 from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, beyond_ends, core_pixels, significance_of, support
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.detect.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
@@ -88,7 +88,7 @@ def fit_crossing(
         ]
         images = [b[0].sum(0, keepdims=True) if ends else b[0] for b in blocks]
         counts = [len(i) for i in images]
-        linear = np.column_stack([*np.concatenate(images), *_lapping([b[0].sum(0) for b in blocks]), surface])
+        linear = columns([*images, *_lapping([b[0].sum(0) for b in blocks]), surface.T])
         theta = weighted_least_squares(linear, weight, data, 1e-6)
         ground = surface[:, 1:] @ theta[-surface.shape[1] + 1 :]
         starts = np.concatenate([[0], np.cumsum(counts)])
@@ -97,8 +97,8 @@ def fit_crossing(
         ]
         moves = []
         for f, (_, d_col, d_row, d_w, d_l, d_angle) in zip(now, blocks, strict=True):
-            moves += [f.depths @ d for d in (d_col, d_row, d_w, d_l)[: 2 + n_shape]] + [f.depths @ d_angle]
-        jac = np.column_stack([*moves, linear])
+            moves += [(f.depths @ d)[None] for d in (d_col, d_row, d_w, d_l)[: 2 + n_shape]] + [(f.depths @ d_angle)[None]]
+        jac = columns([*moves, linear.T])
         residual = data - linear @ theta
         if step == steps or converged:
             break
@@ -139,13 +139,13 @@ def fit_crossing(
 
 
 def _lapping(shadows: Sequence[Float]) -> list[Float]:
-    """Return the product of the shadows of two needles, summed over all pairs, if any lie on each other.
+    """Return the product of the shadows of two needles, summed over all pairs, as one row, if any lie on each other.
 
     There the film does not show their sum: its curve is bent, and those of two exposures take of each half the light. How much of the
     product it shows, the film tells; left out, it draws the two towards each other.
     """
     product = (np.sum(shadows, axis=0) ** 2 - np.sum(np.square(shadows), axis=0)) / 2
-    return [product] if product.max(initial=0.0) > _LAPPING else []
+    return [product[None]] if product.max(initial=0.0) > _LAPPING else []
 
 
 def _gain(fit: NeedleFit, ground: Float, optics: Optics) -> Float | float:

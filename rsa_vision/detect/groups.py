@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, polynomial, uneven
 from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.detect.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.profiles import ball_table
 from rsa_vision.types import Float
 
@@ -78,13 +78,13 @@ def fit_group(
     def linear_part(value: Float) -> tuple[Float, list[tuple[int, int]], list[Float]]:
         # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
         pairs: list[tuple[int, int]] = []
-        columns: list[Float] = []
+        products: list[Float] = []
         slopes: list[Float] = []
         for pair in lapping(local, radius):
             product, by = product_image(local[list(pair)], radius[list(pair)], sigma_px, mu_px, patch.size)
             if product.max() > LEAST:
-                pairs, columns, slopes = [*pairs, pair], [*columns, product], [*slopes, by]
-        return np.column_stack([*value, surface, *columns]), pairs, slopes
+                pairs, products, slopes = [*pairs, pair], [*products, product[None]], [*slopes, by]
+        return columns([value, surface.T, *products]), pairs, slopes
 
     value, d_col, d_row, d_radius = model()
     linear, pairs, slopes = linear_part(value)
@@ -100,7 +100,7 @@ def fit_group(
         by_shape = depth * np.stack([d_col, d_row, d_radius])
         for of_product, pair, by in zip(theta[linear.shape[1] - len(pairs) :], pairs, slopes, strict=True):
             by_shape[:, list(pair)] += of_product * by.transpose(1, 0, 2)
-        jac = np.column_stack([*by_shape.reshape(3 * k, -1), linear])
+        jac = columns([by_shape.reshape(3 * k, -1), linear.T])
         residual = data - linear @ theta
         if step == _STEPS or converged:
             break
@@ -175,5 +175,5 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
     step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
     distance = np.abs(t[:, None] - np.arange(t.min(), t.max() + step, step)) / step
     near, far = 2 / 3 - distance**2 + distance**3 / 2, np.maximum(2 - distance, 0) ** 3 / 6
-    columns: Float = np.where(distance < 1, near, far)
-    return columns
+    splines: Float = np.where(distance < 1, near, far)
+    return splines

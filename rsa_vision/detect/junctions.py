@@ -6,6 +6,7 @@ are sampled only where the filter answers at all.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -17,6 +18,7 @@ from rsa_vision.types import Float
 RINGS_PX = (6.0, 9.0, 13.0, 19.0)  # film pixels; a tee shows on the rings that lie within its arms
 DIRECTIONS = 24
 LEAST = 1.5  # score, in units of what counts as significant
+_CHUNK = 8192  # points whose rings fit into the cache
 _GAP = 0.5  # between the arms the answer may reach this part of the weakest arm
 
 
@@ -54,21 +56,22 @@ def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Floa
     quarter, eighth = DIRECTIONS // 4, DIRECTIONS // 8
     best = np.zeros(answer.shape, np.float32)
     angle, ring = np.zeros(answer.shape, np.float32), np.zeros(answer.shape, np.float32)
-    scaled = (answer / limit).astype(np.float32)
-    for radius in RINGS_PX:
-        for begin in range(0, len(row), 200_000):
-            r, c = row[begin : begin + 200_000], col[begin : begin + 200_000]
-            x = c[:, None] + (radius / size * np.cos(theta))[None]
-            y = r[:, None] - (radius / size * np.sin(theta))[None]
-            samples = _sample(scaled, x, y)
-            near = np.maximum(np.roll(samples, 1, 1), np.maximum(samples, np.roll(samples, -1, 1)))
-            arms = np.minimum(near, np.minimum(np.roll(near, quarter, 1), np.roll(near, -quarter, 1)))
-            gaps = np.roll(samples, -2 * quarter, 1)  # opposite to the stem
+    margin = int(RINGS_PX[-1] / size) + 1
+    scaled = np.pad((answer / limit).astype(np.float32), margin, mode="edge")
+    around_c, around_r = (np.rint(np.outer(RINGS_PX, way) / size).astype(np.intp) for way in (np.cos(theta), -np.sin(theta)))
+    for radius, offset in zip(RINGS_PX, around_r * scaled.shape[1] + around_c, strict=True):
+        for begin in range(0, len(row), _CHUNK):
+            r, c = row[begin : begin + _CHUNK], col[begin : begin + _CHUNK]
+            samples = scaled.ravel().take((r + margin) * scaled.shape[1] + c + margin + offset[:, None])
+            beside = _turned(samples)
+            near = _turned(np.maximum(beside(1), np.maximum(samples, beside(-1))))
+            arms = np.minimum(near(0), np.minimum(near(quarter), near(-quarter)))
+            gaps = beside(2 * quarter)  # opposite to the stem
             for turn in (eighth, -eighth, quarter + eighth, -quarter - eighth):
-                gaps = np.maximum(gaps, np.roll(samples, -turn, 1))
+                gaps = np.maximum(gaps, beside(turn))
             score = np.where(gaps < _GAP * arms, arms - np.maximum(gaps, 0), 0)
-            k = score.argmax(1)
-            value = score[np.arange(len(r)), k]
+            k = score.argmax(0)
+            value = score[k, np.arange(len(r))]
             better = value > best[r, c]
             r, c, k = r[better], c[better], k[better]
             best[r, c], angle[r, c], ring[r, c] = value[better], theta[k], radius
@@ -77,8 +80,7 @@ def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Floa
     return np.stack([(c + 0.5) * size - 0.5, (r + 0.5) * size - 0.5, angle[r, c], ring[r, c], best[r, c]], axis=1).astype(np.float64)
 
 
-def _sample(image: NDArray[Any], x: Float, y: Float) -> NDArray[Any]:
-    x = np.clip(np.rint(x), 0, image.shape[1] - 1).astype(np.intp)
-    y = np.clip(np.rint(y), 0, image.shape[0] - 1).astype(np.intp)
-    out: NDArray[Any] = image[y, x]
-    return out
+def _turned(samples: NDArray[Any]) -> Callable[[int], NDArray[Any]]:
+    """Return views of samples (directions along the first axis) as seen after a turn by so many directions."""
+    twice = np.concatenate([samples, samples])
+    return lambda turn: twice[turn % DIRECTIONS : turn % DIRECTIONS + DIRECTIONS]

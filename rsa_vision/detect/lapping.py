@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.types import Float
 
 FINE = 3  # samples along a pixel
 LEAST = 0.02  # largest value below which the product is nothing
 _STEP_PX = 0.05
+_ROOM_PX = 2 * _STEP_PX
 _BLURS = 4.0  # beyond which the blurred product has faded
 
 
@@ -19,6 +22,18 @@ def lapping(local: Float, radius: Float) -> list[tuple[int, int]]:
     gap = np.hypot(*(local[:, None] - local[None]).transpose(2, 0, 1))
     over = gap < radius[:, None] + radius[None] - _STEP_PX
     return [(i, j) for i in range(k) for j in range(i) if over[i, j]]
+
+
+@lru_cache(maxsize=64)
+def _blur_to_pixels(n: int, sigma_px: float) -> tuple[Float, Float]:
+    """Return what makes pixels of ``n`` fine samples along one axis: blurred, without the two pixels at either end; and their slopes."""
+    blur = gaussian_filter1d(np.eye(n), sigma_px * FINE, axis=0, mode="constant", truncate=_BLURS)
+
+    def seen(fine: Float) -> Float:
+        pixels: Float = fine.reshape(n // FINE, FINE, n).mean(1)[2:-2]
+        return pixels
+
+    return seen(blur), seen(np.gradient(blur, 1 / FINE, axis=0))
 
 
 def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, size: int) -> tuple[Float, Float]:
@@ -53,32 +68,31 @@ def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, si
     if (last <= first).any():
         return value.ravel(), slopes.reshape(2, 3, -1)
     # two pixels more on each side, for the blur not to meet the border of the box
-    x, y = ((np.arange((high - low + 4) * FINE) + 0.5) / FINE - 2.5 + low - at for low, high, at in zip(first, last, local[0], strict=True))
+    lengths = (last - first + 4) * FINE
+    fine = [(np.arange(n) + 0.5) / FINE - 2.5 + low - at for n, low, at in zip(lengths, first, local[0], strict=True)]
+    # the product is nothing but where the two lie over each other
+    both = [
+        (f > max(-radius[0], d - radius[1]) - _ROOM_PX) & (f < min(radius[0], d + radius[1]) + _ROOM_PX)
+        for f, d in zip(fine, apart, strict=True)
+    ]
+    x, y = fine[0][both[0]], fine[1][both[1]]
 
-    def image(dx: float, dy: float, r1: float, r2: float) -> Float:
-        def opacity(x: Float, y: Float, r: float) -> Float:
-            chord = 2 * np.sqrt(np.maximum(r * r - (x * x)[None] - (y * y)[:, None], 0.0))
-            opaque: Float = -np.expm1(-mu_px * chord)
-            return opaque
+    def opacity(ball: int, dx: float = 0.0, dy: float = 0.0, larger: float = 0.0) -> Float:
+        u, v = (x, y) if ball == 0 else (x - apart[0], y - apart[1])
+        chord = 2 * np.sqrt(np.maximum((radius[ball] + larger) ** 2 - ((u - dx) ** 2)[None] - ((v - dy) ** 2)[:, None], 0.0))
+        opaque: Float = -np.expm1(-mu_px * chord)
+        return opaque
 
-        sharp = opacity(x, y, r1) * opacity(x - dx, y - dy, r2)
-        blurred: Float = gaussian_filter(sharp, sigma_px * FINE, mode="constant", truncate=_BLURS)
-        return blurred
-
-    def seen(fine: Float) -> Float:
-        h, w = fine.shape
-        pixels: Float = fine.reshape(h // FINE, FINE, w // FINE, FINE).mean((1, 3))[2:-2, 2:-2]
-        return pixels
-
-    at = np.array([apart[0], apart[1], radius[0], radius[1]])
-    fine = image(*at)
-    by_row, by_col = (np.gradient(fine, 1 / FINE, axis=axis) for axis in (0, 1))
-    by = [(image(*(at + step)) - image(*(at - step))) / (2 * _STEP_PX) for step in _STEP_PX * np.eye(4)]
+    one, two = opacity(0), opacity(1)
+    # of the second ball's moves, and of either radius: blurring is linear, so differences are taken first
+    by_sharp = [one * (opacity(1, *step) - opacity(1, *-step)) for step in _STEP_PX * np.eye(3)]
+    by_sharp.append((opacity(0, larger=_STEP_PX) - opacity(0, larger=-_STEP_PX)) * two)
+    across, down = ([m[:, part] for m in _blur_to_pixels(int(n), sigma_px)] for n, part in zip(lengths, both, strict=True))
+    seen = down[0] @ (one * two) @ across[0].T
+    by_row, by_col = down[1] @ (one * two) @ across[0].T, down[0] @ (one * two) @ across[1].T
+    by_two_x, by_two_y, by_two_r, by_one_r = down[0] @ (np.array(by_sharp) / (2 * _STEP_PX)) @ across[0].T
     box = (slice(first[1], last[1]), slice(first[0], last[0]))
-    value[box] = seen(fine)
+    value[box] = seen
     # moving both moves the image; moving the second alone changes what they share
-    parts = [[-by_col - by[0], -by_row - by[1], by[2]], [by[0], by[1], by[3]]]
-    for ball, three in enumerate(parts):
-        for kind, part in enumerate(three):
-            slopes[(ball, kind, *box)] = seen(part)
+    slopes[(slice(None), slice(None), *box)] = [[-by_col - by_two_x, -by_row - by_two_y, by_one_r], [by_two_x, by_two_y, by_two_r]]
     return value.ravel(), slopes.reshape(2, 3, -1)

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.detect.balls import polynomial
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.detect.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
@@ -118,13 +118,13 @@ def _table(
     side = round((p0 - p1) / CELL)
     by_width = (wide[: base.shape[0], side : side + base.shape[1]] - base) / GRID_W
     by_length = (long[: base.shape[0]] - base) / GRID_L
-    columns = np.stack([base, np.gradient(base, CELL, axis=0), np.gradient(base, CELL, axis=1), by_width, by_length], axis=-1)
-    return columns.reshape(-1, 5), base.shape, s0, p0
+    nodes = np.stack([base, np.gradient(base, CELL, axis=0), np.gradient(base, CELL, axis=1), by_width, by_length], axis=-1)
+    return nodes.reshape(-1, 5), base.shape, s0, p0
 
 
 def _look_up(table: tuple[Float, tuple[int, int], float, float], s: Float, p: Float) -> Float:
     """Interpolate all columns of a table bilinearly; 0 beyond it."""
-    columns, (n_s, n_p), s0, p0 = table
+    nodes, (n_s, n_p), s0, p0 = table
     at_s, at_p = (s - s0) / CELL, (p - p0) / CELL
     out = np.zeros((5, len(s)))
     inside = np.nonzero((at_s >= 0) & (at_s < n_s - 1) & (at_p >= 0) & (at_p < n_p - 1))[0]
@@ -132,10 +132,10 @@ def _look_up(table: tuple[Float, tuple[int, int], float, float], s: Float, p: Fl
     low_s, low_p = at_s.astype(np.intp), at_p.astype(np.intp)
     part_s, part_p = (at_s - low_s)[:, None], (at_p - low_p)[:, None]
     first = low_s * n_p + low_p
-    near = columns[first]
-    near += part_p * (columns[first + 1] - near)
-    far = columns[first + n_p]
-    far += part_p * (columns[first + n_p + 1] - far)
+    near = nodes.take(first, axis=0)
+    near += part_p * (nodes.take(first + 1, axis=0) - near)
+    far = nodes.take(first + n_p, axis=0)
+    far += part_p * (nodes.take(first + n_p + 1, axis=0) - far)
     near += part_s * (far - near)
     out[:, inside] = near.T
     return out
@@ -166,14 +166,11 @@ def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: 
     off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % GRID_L
     film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
     table = _table(round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4), shape.taper, *film)
-    arms = []
-    for angle in angles:
-        c, s = np.cos(angle), -np.sin(angle)
-        along, across = dx * c + dy * s, dy * c - dx * s
-        base, g_s, g_p, more_w, more_l = _look_up(table, along, across)
-        d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
-        arms.append((base + off_w * more_w + off_l * more_l, g_p * s - g_s * c, -g_s * s - g_p * c, more_w, more_l, d_angle))
-    return np.array(arms).swapaxes(0, 1)
+    c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
+    along, across = dx * c + dy * s, dy * c - dx * s
+    base, g_s, g_p, more_w, more_l = _look_up(table, along.ravel(), across.ravel()).reshape(5, *along.shape)
+    d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
+    return np.array([base + off_w * more_w + off_l * more_l, g_p * s - g_s * c, -g_s * s - g_p * c, more_w, more_l, d_angle])
 
 
 def thick_ends(dx: Float, dy: Float, angles: Float, shape: NeedleShape, sigma: float) -> Bool:
@@ -283,14 +280,14 @@ def fit_needles(
     steps, close = (6, _CLOSE_PX) if quick else (_STEPS, _CONVERGED_PX)
     for step in range(steps + 1):
         value, d_col, d_row, d_w, d_l, d_angle = arm_images(cols - tip[0], rows - tip[1], angles, shape, optics)
-        linear = np.column_stack([*(value.sum(0, keepdims=True) if n_depth < k else value), surface])
+        linear = columns([value.sum(0, keepdims=True) if n_depth < k else value, surface.T])
         if step == 0 or step == steps or converged:
             theta = weighted_least_squares(linear, weight, data)
         depths = np.broadcast_to(theta[:n_depth], (k,)).copy()
         residual = data - linear @ theta
-        common = [depths @ d for d in (d_col, d_row, d_w, d_l)[: 2 + n_shape]]
+        common = [(depths @ d)[None] for d in (d_col, d_row, d_w, d_l)[: 2 + n_shape]]
         turns = depths[:, None] * d_angle
-        jac = np.column_stack([*common, *(turns.sum(0, keepdims=True) if rigid else turns), linear])
+        jac = columns([*common, turns.sum(0, keepdims=True) if rigid else turns, linear.T])
         if step == steps or converged:
             break
         if step in (1, 4):

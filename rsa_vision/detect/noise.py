@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 from scipy.special import chdtri
 
 from rsa_vision.types import Float
@@ -213,12 +215,19 @@ def influence_covariance(influence: Float, correlation: Float) -> Float:
     -------
     ndarray of shape (p, p)
     """
-    size = influence.shape[1] + correlation.shape[0]
-    spectrum = np.fft.rfft2(influence, s=(size, size))
-    shift = correlation.shape[0] // 2
-    kernel = np.zeros((size, size))
-    kernel[: correlation.shape[0], : correlation.shape[1]] = correlation
-    power = np.fft.rfft2(np.roll(kernel, (-shift, -shift), (0, 1))).real
-    spread = np.fft.irfft2(spectrum * np.maximum(power, 0.0), s=(size, size))[:, : influence.shape[1], : influence.shape[2]]
-    covariance: Float = np.einsum("prc,qrc->pq", influence, spread)
+    # by Parseval's theorem in the frequency domain; all but the first and the last column of the half spectrum count for two
+    size = next_fast_len(influence.shape[1] + correlation.shape[0], real=True)
+    spectrum = np.fft.rfft2(influence, s=(size, size)).reshape(len(influence), -1)
+    weighted = spectrum * _power(correlation.tobytes(), len(correlation), size)
+    covariance: Float = (weighted @ spectrum.conj().T).real
     return covariance
+
+
+@lru_cache(maxsize=64)
+def _power(correlation: bytes, side: int, size: int) -> Float:
+    """Return the power of correlated noise at the frequencies of ``rfft2``, for sums over the half spectrum to be sums over pixels."""
+    kernel = np.zeros((size, size))
+    kernel[:side, :side] = np.frombuffer(correlation).reshape(side, side)
+    power = np.maximum(np.fft.rfft2(np.roll(kernel, (-(side // 2), -(side // 2)), (0, 1))).real, 0.0) / size**2
+    power[:, 1 : (size + 1) // 2] *= 2
+    return np.asarray(power.ravel())

@@ -63,6 +63,11 @@ def cut(film: NDArray[Any], centres_px: Float, half: int, noise: NoiseModel) -> 
     return Patches(values, valid, corner)
 
 
+def columns(blocks: list[Float]) -> Float:
+    """Put blocks of rows of shape (k, n) beside each other as the columns of a design matrix (n, p), each in one piece in memory."""
+    return np.concatenate(blocks).T
+
+
 def weighted_least_squares(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
     """Return one damped Gauss-Newton step: the weighted least-squares solution with columns scaled to one.
 
@@ -77,10 +82,11 @@ def weighted_least_squares(jac: Float, weight: Float, target: Float, damping: fl
     -------
     ndarray of shape (p,)
     """
-    weighted = jac * weight[:, None]
-    normal = weighted.T @ jac
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))
-    normal = normal / np.outer(scale, scale)
-    normal[np.diag_indices_from(normal)] += damping
-    solution: Float = np.linalg.solve(normal, weighted.T @ target / scale) / scale
+    root = np.sqrt(weight)
+    weighted = jac * root[:, None]
+    normal = weighted.T @ weighted
+    scale = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
+    normal /= scale[:, None] * scale
+    normal.flat[:: len(scale) + 1] += damping
+    solution: Float = np.linalg.solve(normal, weighted.T @ (root * target) / scale) / scale
     return solution

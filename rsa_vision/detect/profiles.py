@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
 from scipy.special import i0e
 
 from rsa_vision.types import Float
@@ -55,13 +54,11 @@ class BallTable:
 
     Attributes
     ----------
-    value, d_rho, d_radius : ndarray of shape (ny, nx)
+    nodes : ndarray of shape (3, ny, nx)
         Opacity (0..1), and its derivatives by rho/sigma and by r/sigma.
     """
 
-    value: Float
-    d_rho: Float
-    d_radius: Float
+    nodes: Float
 
     def evaluate(self, x: Float, y: Float) -> tuple[Float, Float, Float]:
         """Interpolate the table bilinearly.
@@ -77,7 +74,7 @@ class BallTable:
         -------
         value, d_rho, d_radius : ndarrays of the shape of ``x``
         """
-        ny, nx = self.value.shape
+        _, ny, nx = self.nodes.shape
         row = np.clip((np.log(y) - np.log(_Y_MIN)) / _Y_STEP, 0, ny - 1.001)
         top = row.astype(np.intp)
         frac = (row - top)[:, None]
@@ -85,13 +82,12 @@ class BallTable:
         col = np.minimum(x / _X_STEP, nx - 1.001)
         left = col.astype(np.intp)
         part = col - left
-        index = left + (np.arange(len(y)) * nx).reshape((-1,) + (1,) * (x.ndim - 1))
-        out = []
-        for table in (self.value, self.d_rho, self.d_radius):
-            line = (table[top] * (1 - frac) + table[top + 1] * frac).ravel()
-            low = line[index]
-            out.append(low + part * (line[index + 1] - low))
-        return out[0], out[1], out[2]
+        reach = int(left.max(initial=0)) + 2
+        line = (self.nodes[:, top, :reach] * (1 - frac) + self.nodes[:, top + 1, :reach] * frac).reshape(3, -1)
+        index = left + (np.arange(len(y)) * reach).reshape((-1,) + (1,) * (x.ndim - 1))
+        low = line.take(index, axis=1)
+        value, d_rho, d_radius = low + part * (line.take(index + 1, axis=1) - low)
+        return value, d_rho, d_radius
 
 
 @lru_cache(maxsize=64)
@@ -107,6 +103,37 @@ def ball_table(mu_sigma: float) -> BallTable:
     -------
     BallTable
     """
+    blur = _blur()
+    opacity = -np.expm1(-2 * mu_sigma * blur.half_chord)
+    coarse = np.matmul(blur.kernel, (opacity * blur.weight)[:, :, None])[:, :, 0]
+    of_y, by_y = blur.along_y
+    of_x, by_x = blur.along_x
+    return BallTable(np.array([of_y @ coarse @ of_x.T, of_y @ coarse @ by_x.T, by_y @ coarse @ of_x.T]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Blur:
+    """What the tables of all attenuations share.
+
+    Attributes
+    ----------
+    half_chord, weight : ndarray of shape (k, 40)
+        Half the chord at the nodes of a quadrature, and their weights in it, for ``k`` radii.
+    kernel : ndarray of shape (k, m, 40)
+        Blurred image of a ring, at ``m`` distances.
+    along_y, along_x : tuple of two ndarrays, of shapes (ny, k) and (nx, m)
+        Cubic spline from the coarse to the fine grid, and its derivative.
+    """
+
+    half_chord: Float
+    weight: Float
+    kernel: Float
+    along_y: tuple[Float, Float]
+    along_x: tuple[Float, Float]
+
+
+@lru_cache(maxsize=1)
+def _blur() -> _Blur:
     log_y = np.arange(np.log(_Y_MIN), np.log(_Y_MAX) + _Y_STEP, _Y_STEP)
     coarse_log_y = np.linspace(log_y[0], log_y[-1], 100)
     x = np.arange(0.0, _Y_MAX + REACH, _X_STEP)
@@ -114,12 +141,31 @@ def ball_table(mu_sigma: float) -> BallTable:
     y = np.exp(coarse_log_y)
     # t = y sin(a): the square root at the rim becomes smooth, so that few nodes suffice
     angle = (_NODES + 1) * np.pi / 4
-    t = y[:, None] * np.sin(angle)
-    opacity = -np.expm1(-2 * mu_sigma * y[:, None] * np.cos(angle))
-    weight = opacity * t * y[:, None] * np.cos(angle) * _WEIGHTS * np.pi / 4
+    t, half_chord = y[:, None] * np.sin(angle), y[:, None] * np.cos(angle)
     rho = coarse_x[None, :, None]
     kernel = np.exp(-0.5 * (rho - t[:, None, :]) ** 2) * i0e(rho * t[:, None, :])
-    coarse = np.einsum("yxk,yk->yx", kernel, weight)
-    spline = RectBivariateSpline(coarse_log_y, coarse_x, coarse)
-    d_radius = spline(log_y, x, dx=1) / np.exp(log_y)[:, None]
-    return BallTable(spline(log_y, x), spline(log_y, x, dy=1), d_radius)
+    of_y, by_log_y = _interpolation(coarse_log_y, log_y)
+    by_y = by_log_y / np.exp(log_y)[:, None]
+    return _Blur(half_chord, t * half_chord * _WEIGHTS * np.pi / 4, kernel, (of_y, by_y), _interpolation(coarse_x, x))
+
+
+def _interpolation(nodes: Float, at: Float) -> tuple[Float, Float]:
+    """Return the matrices that make, of values at evenly spaced nodes (n,), those of their cubic spline and its slopes, shape (m, n).
+
+    No knots at the second node and the last but one, as no slopes at the ends are known (de Boor, A Practical Guide to Splines, 1978).
+    """
+    n, step = len(nodes), nodes[1] - nodes[0]
+    centre = np.arange(-1, n + 1)
+
+    def basis(t: Float) -> tuple[Float, Float]:
+        apart = t[:, None] - centre
+        far = np.maximum(2 - np.abs(apart), 0.0)
+        near = np.maximum(1 - np.abs(apart), 0.0)
+        return far**3 / 6 - 4 * near**3 / 6, np.sign(apart) * (2 * near**2 - far**2 / 2)
+
+    conditions = np.zeros((n + 2, n + 2))
+    conditions[:n] = basis(np.arange(n))[0]
+    conditions[n, :5] = conditions[n + 1, -5:] = 1, -4, 6, -4, 1  # the third derivative does not jump
+    coefficients = np.linalg.inv(conditions)[:, :n]
+    value, slope = basis((at - nodes[0]) / step)
+    return value @ coefficients, slope @ coefficients / step

@@ -151,12 +151,15 @@ def _mean_misfit(fits: list[NeedleFit]) -> float:
 
 def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Starts at every place that looks like one of the models."""
+    found = [find_like(film, m, optics) for m in models]
+    model = np.repeat(np.arange(len(models)), [len(f) for f in found])
+    places = np.concatenate(found)
     starts: list[NeedleFit] = []
-    places = [(likeness, col, row, m) for m in models for col, row, likeness in find_like(film, m, optics)]
-    for _, col, row, model in sorted(places, key=lambda p: -p[0]):
-        at = np.array([col, row])
-        if all(np.hypot(*(s.position_px - at)) > _NEAREST_PX for s in starts):
-            starts.append(replace(model, position_px=at))
+    free = np.ones(len(places), bool)
+    for i in np.argsort(-places[:, 2], kind="stable"):
+        if free[i]:
+            starts.append(replace(models[model[i]], position_px=places[i, :2]))
+            free &= np.hypot(*(places[:, :2] - places[i, :2]).T) > _NEAREST_PX
     return _peeled(film, starts, optics, noise)
 
 

@@ -132,11 +132,11 @@ def closest_approach(through_a: Float, origin_a: Float, through_b: Float, origin
     """
     difference_a, difference_b = origin_a - through_a, origin_b - through_b
     offset = through_b - through_a
-    aa, bb = (difference_a**2).sum(-1), (difference_b**2).sum(-1)
-    ab = (difference_a * difference_b).sum(-1)
-    a_offset, b_offset = (difference_a * offset).sum(-1), (difference_b * offset).sum(-1)
+    aa, bb, ab = _dot(difference_a, difference_a), _dot(difference_b, difference_b), _dot(difference_a, difference_b)
+    a_offset, b_offset = _dot(difference_a, offset), _dot(difference_b, offset)
     # |a x b|^2 by the cross product: aa bb - ab^2 loses the digits of a small angle
-    determinant = (np.cross(difference_a, difference_b) ** 2).sum(-1)
+    perpendicular = np.cross(difference_a, difference_b)
+    determinant = _dot(perpendicular, perpendicular)
     with np.errstate(divide="ignore", invalid="ignore"):
         determinant = np.where(determinant > PARALLEL * aa * bb, determinant, np.nan)
         fraction_a = (a_offset * bb - ab * b_offset) / determinant
@@ -184,6 +184,11 @@ def cross(a: RayBundle, b: RayBundle) -> tuple[Float, Float, Float]:
         common = (over_b @ b.cage_effect_mm).swapaxes(0, 1) - leverage_a @ a.cage_effect_mm
         variance += (common**2).sum(-1)
     return (point_a + point_b) / 2, np.abs(signed), np.sqrt(variance)
+
+
+def _dot(a: Float, b: Float) -> Float:
+    product: Float = np.einsum("...i,...i->...", a, b)  # sums over a short last axis take several times as long
+    return product
 
 
 def _leverage(perpendicular: Float, fraction: Float) -> Float:

@@ -65,8 +65,10 @@ def angle_difference_deg(scene: Scene, parameters: Float, images: FilmImages) ->
     stem = np.nan_to_num(scene.stem)
     step = project(scene, parameters, xyz_mm=scene.xyz_mm + 0.5 * stem) - project(scene, parameters)
     predicted = np.where(np.hypot(*step.T) > 0.1, np.arctan2(step[:, 1], step[:, 0]), np.nan)
-    turned = (images.angle_rad[None] - predicted[:, None] + np.pi) % (2 * np.pi) - np.pi
-    return np.where(scene.shape[:, None] == images.shape[None], np.rad2deg(turned), np.nan)
+    row, column = np.nonzero((scene.shape[:, None] == images.shape) & np.isfinite(predicted)[:, None] & np.isfinite(images.angle_rad))
+    turned = np.full((len(scene.mark), len(images.xy_mm)), np.nan)
+    turned[row, column] = np.rad2deg((images.angle_rad[column] - predicted[row] + np.pi) % (2 * np.pi) - np.pi)
+    return turned
 
 
 def on_bodies(scene: Scene, parameters: Float, images: FilmImages, rows: Int) -> Bool:
@@ -88,7 +90,8 @@ def on_bodies(scene: Scene, parameters: Float, images: FilmImages, rows: Int) ->
         if mine.any():
             which = rows[mine]
             way = project(scene, parameters, which, xyz_mm=scene.xyz_mm[which] + scene.arms_mm[which, arm]) - place[mine]
-            along = np.clip((offset[mine] * way[:, None]).sum(-1) / (way**2).sum(-1).clip(1e-9)[:, None], 0, 1)
-            rest = offset[mine] - along[..., None] * way[:, None]
-            result[mine] |= (np.hypot(rest[..., 0], rest[..., 1]) < 1.2 * width[mine][:, None] + BODY_MM) & ~wide[mine]
+            (x, y), (way_x, way_y) = np.moveaxis(offset[mine], -1, 0), way.T[:, :, None]
+            along = np.clip((x * way_x + y * way_y) / (way_x**2 + way_y**2).clip(1e-9), 0, 1)
+            rest = np.hypot(x - along * way_x, y - along * way_y)
+            result[mine] |= (rest < 1.2 * width[mine][:, None] + BODY_MM) & ~wide[mine]
     return result

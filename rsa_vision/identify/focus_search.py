@@ -43,7 +43,7 @@ def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm:
     least = needed(len(controls_mm), 2, missing)
     through = np.column_stack([images_mm, np.zeros(len(images_mm))])
     towards = controls_mm[:, None] - through[None]
-    distance = np.linalg.norm(np.cross(towards, nominal_mm - through[None]), axis=-1) / np.linalg.norm(towards, axis=-1)
+    distance = _length(np.cross(towards, nominal_mm - through[None])) / _length(towards)
     slack = NEAR_MM * nominal_mm[2] / np.abs(controls_mm[:, 2]).clip(1.0)
     mark, image = np.nonzero(distance < reach_mm + slack[:, None])
     if len(np.unique(mark)) < least:
@@ -51,18 +51,16 @@ def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm:
     if len(mark) > MOST_LINES:
         nearest = np.argsort(distance[mark, image])[:MOST_LINES]
         mark, image = mark[nearest], image[nearest]
-    spread = np.linalg.norm(controls_mm[:, None] - controls_mm[None], axis=-1)
-    first, second = np.triu_indices(len(mark), 1)
+    spread = _length(controls_mm[:, None] - controls_mm[None])
     apart = 0.35 * spread.max() if len(controls_mm) > FEW else 0.0  # of a few any two may be all that is left
-    wide = (spread[mark[first], mark[second]] > apart) & (image[first] != image[second])
-    first, second = first[wide], second[wide]
+    first, second = np.nonzero(np.triu((spread[mark][:, mark] > apart) & (image[:, None] != image), 1))
     near_a, near_b, *_ = closest_approach(
         through[image[first]], controls_mm[mark[first]], through[image[second]], controls_mm[mark[second]]
     )
     focus = (near_a + near_b) / 2
     with np.errstate(invalid="ignore"):
-        crossing = np.linalg.norm(near_a - near_b, axis=1) < slack[mark[first]] + slack[mark[second]]
-        focus = focus[crossing & (np.linalg.norm(focus - nominal_mm, axis=1) < reach_mm * 1.1 + 20)]
+        crossing = _length(near_a - near_b) < slack[mark[first]] + slack[mark[second]]
+        focus = focus[crossing & (_length(focus - nominal_mm) < reach_mm * 1.1 + 20)]
     if not len(focus):
         return []
     rise = controls_mm[None, :, 2] / (focus[:, None, 2] - controls_mm[None, :, 2])
@@ -72,7 +70,7 @@ def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm:
     for m in range(len(controls_mm)):  # only images that were possible for this mark at all
         options = images_mm[image[mark == m]]
         if len(options):
-            best = ((predicted[:, m, None] - options[None]) ** 2).sum(-1).min(axis=1)
+            best = sum((predicted[:, m, axis, None] - options[:, axis]) ** 2 for axis in range(2)).min(axis=1)
             hit[:, m] = best < NEAR_MM**2
             squared += np.minimum(best, NEAR_MM**2)
     votes = hit.sum(axis=1)
@@ -83,3 +81,8 @@ def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm:
         if all(np.abs(focus[index, :2] - other[:2]).max() > 12 or abs(focus[index, 2] - other[2]) > 60 for other, _ in found):
             found.append((focus[index], int(votes[index])))
     return found
+
+
+def _length(vectors: Float) -> Float:
+    length: Float = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+    return length

@@ -151,11 +151,11 @@ def _hypotheses(images: Float, tree: cKDTree, marks: Float, turn_deg: float, lea
         side = marks[b] - marks[a]
         base = np.hypot(*side)
         low, high = SCALE[0] * (1 - SHEAR) * base, SCALE[1] * (1 + SHEAR) * base
-        possible = (length > low) & (length < high)
+        first, second = np.nonzero((length > low) & (length < high))
         if turn_deg < 180:
-            turn = (direction - np.arctan2(side[1], side[0]) + np.pi) % (2 * np.pi) - np.pi
-            possible &= np.abs(turn) < np.deg2rad(turn_deg + 3)
-        first, second = np.nonzero(possible)
+            turn = (direction[first, second] - np.arctan2(side[1], side[0]) + np.pi) % (2 * np.pi) - np.pi
+            upright = np.abs(turn) < np.deg2rad(turn_deg + 3)
+            first, second = first[upright], second[upright]
         if not len(first):
             continue
         # the third mark by a similarity, then the image nearest to it
@@ -226,7 +226,7 @@ def _shifts(
     neighbours = [tree.query_ball_point(place, largest + near_mm) for place in places]
     owner = np.repeat(np.arange(len(marks)), [len(some) for some in neighbours])
     shifts = images[np.concatenate([np.array(some, int) for some in neighbours])] - places[owner]
-    apart = np.abs(shifts[:, None] - shifts[None]).max(axis=2)
+    apart = np.maximum(*(np.abs(along[:, None] - along) for along in shifts.T))
     starts = np.flatnonzero(np.diff(owner, prepend=-1))  # one mark may have many images near a shift, and counts once
     nearest = np.minimum.reduceat(apart, starts, axis=1) < near_mm
     votes = nearest.sum(axis=1)

@@ -44,13 +44,15 @@ def find_hypotheses(scene: Scene, xy_mm: Float, turn_deg: float, missing: float,
             half = np.ptp(fiducials, axis=0) / 2
             keystone = 2 * TILTED * TILT_SD * half[0] * half[1] / scene.nominal_mm[k, 2]
             count = len(scene.foci)
-            grids[key] = [
+            every = [
                 grid
                 for near in sorted({GRID_NEAR_MM, max(GRID_NEAR_MM, float(keystone))})
                 for grid in find_grids(
                     xy_mm, fiducials, turn_deg=turn_deg, foci=count, largest_shift_mm=shift, missing=missing, near_mm=near
                 )
             ]
+            # many are found twice, and looking for foci takes longest
+            grids[key] = list({(A.tobytes(), b.tobytes()): (A, b, count) for A, b, count in reversed(every)}.values())[::-1]
         options.append(
             [
                 (A, b, focus, _seen(scene.xyz_mm[mine], focus, A, b, tree))

@@ -64,10 +64,10 @@ def gains(scene: Scene, parameters: Float, images: FilmImages, looks: Float, sla
     """Gain in log likelihood by naming each image as each mark, shape (m, n); -inf outside the gate."""
     offset = images.xy_mm[None] - project(scene, parameters)[:, None]
     result = np.full(offset.shape[:2], -np.inf)
-    row, column = np.nonzero((offset**2).sum(-1) < (4 * slack_mm + 1.0) ** 2)
+    row, column = np.nonzero(offset[..., 0] ** 2 + offset[..., 1] ** 2 < (4 * slack_mm + 1.0) ** 2)
     covariance = images.covariance_mm2[column] + slack_mm**2 * np.eye(2)
     r = offset[row, column]
-    squared = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance), r)
+    squared = np.einsum("ni,ni->n", r, (np.linalg.inv(covariance) @ r[:, :, None])[:, :, 0])
     odds = np.where(scene.own, np.log(SEEN / (1 - SEEN)), np.log(SEEN_FOREIGN / (1 - SEEN_FOREIGN)))
     gain = odds[row] - images.log_density[column] + looks[row, column] - 0.5 * squared
     gain -= np.log(2 * np.pi) + 0.5 * np.linalg.slogdet(covariance)[1]
