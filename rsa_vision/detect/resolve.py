@@ -215,9 +215,7 @@ def _images(known: BallFits, members: Int, optics: Optics, tees: Background | No
     return total, doubtful
 
 
-def _unexplained_pairs(
-    film: NDArray[Any], candidates: Candidates, good: BallFits, optics: Optics, tees: Background | None
-) -> list[Float]:
+def _unexplained_pairs(film: NDArray[Any], candidates: Candidates, good: BallFits, optics: Optics, tees: Background | None) -> list[Float]:
     if len(good.depth) == 0:
         return []
     typical = float(np.median(good.radius_px))
