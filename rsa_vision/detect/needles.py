@@ -304,7 +304,7 @@ def fit_needles(
         if np.hypot(*(tip - tip_px)) > 0.6 * half:
             return _unfit(tip, angles, shape)
     weighted = jac * weight[:, None]
-    covariance: Float = np.linalg.pinv(weighted.T @ jac, hermitian=True)
+    covariance = np.asarray(np.linalg.pinv(weighted.T @ jac, hermitian=True), np.float64)
     influence = np.zeros((2, patch.size, patch.size))
     influence[:, (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)] = (
         covariance[:2] @ (weighted / np.sqrt(weight)[:, None]).T
