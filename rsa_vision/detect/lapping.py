@@ -33,8 +33,7 @@ def _blur_to_pixels(n: int, sigma_px: float) -> tuple[Float, Float]:
         pixels: Float = fine.reshape(n // FINE, FINE, n).mean(1)[2:-2]
         return pixels
 
-    slopes: Float = np.asarray(np.gradient(blur, 1 / FINE, axis=0))
-    return seen(blur), seen(slopes)
+    return seen(blur), seen(np.asarray(np.gradient(blur, 1 / FINE, axis=0)))
 
 
 def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, size: int) -> tuple[Float, Float]:

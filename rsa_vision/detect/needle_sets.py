@@ -31,13 +31,19 @@ _SAMPLE = 18  # arms that are asked for their optics
 _ROUNDS = 2
 
 
-def fit_all(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, ends: bool) -> list[NeedleFit]:
-    """Fit every set whose arms cross in one go, with the images of the others subtracted."""
+def fit_all(
+    film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, ends: bool, again: bool = False
+) -> list[NeedleFit]:
+    """Fit every set whose arms cross in one go, with the images of the others subtracted.
+
+    ``again``: they were fitted in the same way before, so that what has come to rest and has no neighbours stays as it is.
+    """
     out: list[NeedleFit] = []
     for members in clusters(needles):
         rest = [t for t in needles if all(t is not m for m in members)]
         others = others_beside(members, rest, optics, ends=ends)
-        out += fit_crossing(film, members, optics, noise, others=others, ends=ends)
+        at_rest = again and others is None and all(m.converged for m in members)
+        out += members if at_rest else fit_crossing(film, members, optics, noise, others=others, ends=ends)
     return out
 
 

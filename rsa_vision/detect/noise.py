@@ -215,12 +215,11 @@ def influence_covariance(influence: Float, correlation: Float) -> Float:
     -------
     ndarray of shape (p, p)
     """
-    # by Parseval's theorem in the frequency domain; all but the first and the last column of the half spectrum count for two
+    # by Parseval's theorem in the frequency domain, where the columns of the half spectrum but the first and the middle one stand for two
     size = next_fast_len(influence.shape[1] + correlation.shape[0], real=True)
     spectrum = np.fft.rfft2(influence, s=(size, size)).reshape(len(influence), -1)
     weighted = spectrum * _power(correlation.tobytes(), len(correlation), size)
-    covariance: Float = (weighted @ spectrum.conj().T).real
-    return covariance
+    return np.asarray((weighted @ spectrum.conj().T).real, np.float64)
 
 
 @lru_cache(maxsize=64)

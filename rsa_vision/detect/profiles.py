@@ -164,7 +164,7 @@ def _interpolation(nodes: Float, at: Float) -> tuple[Float, Float]:
         return far**3 / 6 - 4 * near**3 / 6, np.sign(apart) * (2 * near**2 - far**2 / 2)
 
     conditions = np.zeros((n + 2, n + 2))
-    conditions[:n] = basis(np.arange(n, dtype=float))[0]
+    conditions[:n] = basis(np.arange(float(n)))[0]
     conditions[n, :5] = conditions[n + 1, -5:] = 1, -4, 6, -4, 1  # the third derivative does not jump
     coefficients = np.linalg.inv(conditions)[:, :n]
     value, slope = basis((at - nodes[0]) / step)

@@ -62,7 +62,7 @@ def resolve_balls(
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     good = single.rows(plausible(single, noise, slack=1.5))
     groups, fits = _groups(good, optics), []
-    for members in _unexplained_pairs(film, candidates, good, optics):
+    for members in _unexplained_pairs(film, candidates, good, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, good)))
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
@@ -215,7 +215,7 @@ def _images(known: BallFits, members: Int, optics: Optics, tees: Background | No
     return total, doubtful
 
 
-def _unexplained_pairs(film: NDArray[Any], candidates: Candidates, good: BallFits, optics: Optics) -> list[Float]:
+def _unexplained_pairs(film: NDArray[Any], candidates: Candidates, good: BallFits, optics: Optics, tees: Background | None) -> list[Float]:
     if len(good.depth) == 0:
         return []
     typical = float(np.median(good.radius_px))
@@ -223,7 +223,7 @@ def _unexplained_pairs(film: NDArray[Any], candidates: Candidates, good: BallFit
     peaks = candidates.position_px[fine]
     if len(peaks) == 0:
         return []
-    peaks = peaks[_deep(film, peaks, typical) > 0.4 * np.median(np.abs(good.depth))]
+    peaks = peaks[_deep(film, peaks, typical, tees) > 0.4 * np.median(np.abs(good.depth))]
     if len(peaks) == 0:
         return []
     gaps = np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1))
@@ -245,14 +245,16 @@ def _unexplained_pairs(film: NDArray[Any], candidates: Candidates, good: BallFit
     return out[:200]
 
 
-def _deep(film: NDArray[Any], peaks: Float, radius: float) -> Float:
-    """How far the film at these places differs from the median of a ring well outside a ball there."""
+def _deep(film: NDArray[Any], peaks: Float, radius: float, tees: Background | None) -> Float:
+    """How far the film less its tees differs at these places from the median of a ring well outside a ball there."""
     angle = 2 * np.pi * np.arange(16) / 16
     reach = 2 * radius + 3
     cols = np.rint(peaks[:, :1] + reach * np.cos(angle)).astype(np.intp).clip(0, film.shape[1] - 1)
     rows = np.rint(peaks[:, 1:] + reach * np.sin(angle)).astype(np.intp).clip(0, film.shape[0] - 1)
     col, row = np.rint(peaks).astype(np.intp).T
     middle = film[row.clip(0, film.shape[0] - 1), col.clip(0, film.shape[1] - 1)].astype(np.float64)
+    if tees is not None:
+        middle -= tees(*peaks.T)
     out: Float = np.abs(middle - np.median(film[rows, cols], axis=1))
     return out
 

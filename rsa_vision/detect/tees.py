@@ -53,8 +53,8 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     if not models:
         return [], [], optics
     tees = _like(film, models, optics, noise)
-    for _ in range(2):
-        tees = _distinct(fit_all(film, tees, optics, noise, ends=True), models[0])
+    for again in (False, True):
+        tees = _distinct(fit_all(film, tees, optics, noise, ends=True, again=again), models[0])
     if not tees:
         return [], [], optics
     around = tees
