@@ -83,9 +83,9 @@ def fit_crossing(
     converged = False
     ground = np.zeros(len(data))  # background above its mean under each pixel
     for step in range(steps + 1):
-        blocks = [
-            arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, optics) * _gain(f, ground, optics) for f in now
-        ]
+        blocks = [arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, optics) for f in now]
+        if optics.proportion:
+            blocks = [block * _gain(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
         images = [b[0].sum(0, keepdims=True) if ends else b[0] for b in blocks]
         counts = [len(i) for i in images]
         linear = columns([*images, *_lapping([b[0].sum(0) for b in blocks]), surface.T])
@@ -109,8 +109,10 @@ def fit_crossing(
         now = [_moved(f, scale * d, half, ends) for f, d in zip(now, delta, strict=True)]
         converged = step > 1 and float(np.abs(delta[:, :2]).max()) < _CONVERGED_PX
     covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
-    influence = np.zeros((len(jac.T), patch.size, patch.size))
-    influence[:, (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)] = covariance @ (jac * np.sqrt(weight)[:, None]).T
+    places = [each * i + axis for i in range(len(now)) for axis in range(2)]
+    influence = np.zeros((len(places), patch.size, patch.size))
+    at = (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)
+    influence[:, *at] = covariance[places] @ (jac * np.sqrt(weight)[:, None]).T
     out = []
     square = weight * residual**2
     for i, (f, block) in enumerate(zip(now, blocks, strict=True)):
@@ -125,7 +127,7 @@ def fit_crossing(
                 f,
                 depth=depth,
                 background=float(theta[-6]),
-                covariance_px2=influence_covariance(influence[each * i : each * i + 2], noise.correlation),
+                covariance_px2=influence_covariance(influence[2 * i : 2 * i + 2], noise.correlation),
                 n_core=int(core.sum()),
                 valid_fraction=min(1.0, int(core.sum()) / max(core_pixels(f.position_px, f.angles, f.shape, optics.sigma_px, ends), 1)),
                 chi2_core=chi2_core,
@@ -144,20 +146,26 @@ def _lapping(shadows: Sequence[Float]) -> list[Float]:
     There the film does not show their sum: its curve is bent, and those of two exposures take of each half the light. How much of the
     product it shows, the film tells; left out, it draws the two towards each other.
     """
+    if len(shadows) < 2:
+        return []
     product = (np.sum(shadows, axis=0) ** 2 - np.sum(np.square(shadows), axis=0)) / 2
     return [product[None]] if product.max(initial=0.0) > _LAPPING else []
 
 
 def _gain(fit: NeedleFit, ground: Float, optics: Optics) -> Float | float:
     """Return the depth at each pixel in units of the depth at the middle, where it goes with the background."""
-    if not optics.proportion or not fit.depth:
+    if not fit.depth:
         return 1.0
     gain: Float = np.clip(1.0 + optics.proportion * ground / fit.depth, *_GAIN)
     return gain
 
 
 def _moved(fit: NeedleFit, delta: Float, half: int, ends: bool) -> NeedleFit:
-    width = float(np.clip(fit.shape.half_width_px + np.clip(delta[2], -0.5, 0.5), 0.6, 0.3 * fit.shape.length_px))
-    longer = float(np.clip(delta[3], -2.0, 2.0)) if ends else 0.0
-    shape = NeedleShape(width, float(np.clip(fit.shape.length_px + longer, 3.0, half / 1.05)), fit.shape.taper)
+    wider, longer = _between(delta[2], -0.5, 0.5), _between(delta[3], -2.0, 2.0) if ends else 0.0
+    width = _between(fit.shape.half_width_px + wider, 0.6, 0.3 * fit.shape.length_px)
+    shape = NeedleShape(width, _between(fit.shape.length_px + longer, 3.0, half / 1.05), fit.shape.taper)
     return replace(fit, position_px=fit.position_px + delta[:2], shape=shape, angles=fit.angles + delta[-1])
+
+
+def _between(value: float, low: float, high: float) -> float:
+    return min(max(float(value), low), high)

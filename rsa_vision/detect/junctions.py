@@ -54,10 +54,10 @@ def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Floa
     row, col = np.nonzero(cv2.dilate(strong, np.ones((5, 5), np.uint8)))
     theta = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     quarter, eighth = DIRECTIONS // 4, DIRECTIONS // 8
+    margin = int(RINGS_PX[-1] / size) + 1
+    scaled = np.pad(np.divide(answer, limit, dtype=np.float32), margin, mode="edge")
     best = np.zeros(answer.shape, np.float32)
     angle, ring = np.zeros(answer.shape, np.float32), np.zeros(answer.shape, np.float32)
-    margin = int(RINGS_PX[-1] / size) + 1
-    scaled = np.pad((answer / limit).astype(np.float32), margin, mode="edge")
     around_c, around_r = (np.rint(np.outer(RINGS_PX, way) / size).astype(np.intp) for way in (np.cos(theta), -np.sin(theta)))
     for radius, offset in zip(RINGS_PX, around_r * scaled.shape[1] + around_c, strict=True):
         for begin in range(0, len(row), _CHUNK):

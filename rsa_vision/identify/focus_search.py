@@ -70,16 +70,18 @@ def find_foci(images_mm: Float, controls_mm: Float, nominal_mm: Float, reach_mm:
     for m in range(len(controls_mm)):  # only images that were possible for this mark at all
         options = images_mm[image[mark == m]]
         if len(options):
-            best = sum((predicted[:, m, axis, None] - options[:, axis]) ** 2 for axis in range(2)).min(axis=1)
-            hit[:, m] = best < NEAR_MM**2
-            squared += np.minimum(best, NEAR_MM**2)
+            nearest = sum((predicted[:, m, axis, None] - options[:, axis]) ** 2 for axis in range(2)).min(axis=1)
+            hit[:, m] = nearest < NEAR_MM**2
+            squared += np.minimum(nearest, NEAR_MM**2)
     votes = hit.sum(axis=1)
     found: list[tuple[Float, int]] = []
-    for index in np.lexsort((squared, -votes)):
-        if votes[index] < least or len(found) >= LARGEST:
-            break
-        if all(np.abs(focus[index, :2] - other[:2]).max() > 12 or abs(focus[index, 2] - other[2]) > 60 for other, _ in found):
-            found.append((focus[index], int(votes[index])))
+    ranked = np.lexsort((squared, -votes))
+    ranked = ranked[votes[ranked] >= least]
+    while len(ranked) and len(found) < LARGEST:
+        best = focus[ranked[0]]
+        found.append((best, int(votes[ranked[0]])))
+        away = np.abs(focus[ranked] - best)
+        ranked = ranked[(away[:, 0] > 12) | (away[:, 1] > 12) | (away[:, 2] > 60)]
     return found
 
 
