@@ -79,7 +79,7 @@ def significance(fits: BallFits) -> Float:
     """Return depth over its standard deviation at the fitted centre and radius, shape (n,).
 
     Radius and depth of a ball that is small against the blur can stand for each other, so that neither is sure alone: that something is
-    there     is.
+    there is.
     """
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", fits.covariance), 1e-30))
     correlation = fits.covariance / (scale[:, :, None] * scale[:, None, :])

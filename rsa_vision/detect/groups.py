@@ -148,7 +148,7 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
     """Return functions that together make any smooth profile across the strongest edge of a window.
 
     The edge of a bone or an implant is straight over the width of a ball: it changes across, not along. A ball changes both ways, so its
-    centre     stays determined, if less well across the edge; the covariance knows.
+    centre stays determined, if less well across the edge; the covariance knows.
 
     Parameters
     ----------

@@ -243,7 +243,7 @@ def fit_needles(
         model does not have: it would turn the arms and so move the tip. So the last fit leaves the ends out and holds the length.
     rigid : bool
         The arms turn together; else each has its own direction. With ``ends`` they are equally deep, too: for a first look, while
-        neighbours         still disturb.
+        neighbours still disturb.
     quick : bool
         While others still move: fewer steps, and a covariance as if the noise were white.
 

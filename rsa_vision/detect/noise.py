@@ -203,7 +203,7 @@ def influence_covariance(influence: Float, correlation: Float) -> Float:
     """Return the covariance of linear functions of correlated noise.
 
     A weighted least-squares fit stays unbiased when the noise of neighbouring pixels is correlated, but its variance is no longer the
-    inverse     of the normal matrix; this is the "sandwich" for it.
+    inverse of the normal matrix; this is the "sandwich" for it.
 
     Parameters
     ----------
