@@ -16,7 +16,7 @@ from rsa_vision.preparation import cage_content, default_study, group, load_geom
 from rsa_vision.provenance import environment, file_sha256
 from rsa_vision.segments import Segments, read_segments
 from rsa_vision.settings import Study
-from rsa_vision.store import to_csv, write_atomic, write_run, write_tables
+from rsa_vision.store import parquet_bytes, to_csv, write_atomic, write_run, write_tables
 from rsa_vision.study_files import natural_key
 
 if TYPE_CHECKING:
@@ -270,8 +270,9 @@ def detect(
     if not images:
         raise UsageError("no image given; name the films to look at")
     settle(None, {"response": response})  # refuses an unknown one
+    drawings = [] if overlay is None else _overlay_paths(Path(overlay), [Path(name) for name in images])
     rows: list[dict[str, Any]] = []
-    for name in images:
+    for number, name in enumerate(images):
         try:
             film = read_film(Path(name))
             found = detect_markers(film.values, bits=film.bits, response=response).images
@@ -283,13 +284,13 @@ def detect(
                 watch(Path(name), -1)
             continue
         rows += detection_rows(str(name), found)
-        if overlay is not None:
-            write_atomic(_overlay_path(Path(overlay), Path(name), len(images)), overlay_png(film.values, found))
+        if drawings:
+            write_atomic(drawings[number], overlay_png(film.values, found))
         if watch:
             watch(Path(name), len(found))
     table = frame(rows, DETECTIONS)
     if out is not None:
-        write_atomic(Path(out), to_csv(table))
+        write_atomic(Path(out), parquet_bytes(table) if Path(out).suffix == ".parquet" else to_csv(table))
     return table
 
 
@@ -411,5 +412,10 @@ def _finish(out: Path, record: Mapping[str, Any]) -> None:
     write_report(out)
 
 
-def _overlay_path(overlay: Path, image: Path, count: int) -> Path:
-    return overlay if count == 1 else overlay.with_name(f"{overlay.stem}_{image.stem}{overlay.suffix or '.png'}")
+def _overlay_paths(overlay: Path, images: Sequence[Path]) -> list[Path]:
+    """One for each image, told apart by the image's name, and by a number where names are the same."""
+    if len(images) == 1:
+        return [overlay]
+    stems = [f"{overlay.stem}_{image.stem}" for image in images]
+    numbers = [f"_{stems[:k].count(stem) + 1}" if stems.count(stem) > 1 else "" for k, stem in enumerate(stems)]
+    return [overlay.with_name(f"{stem}{number}{overlay.suffix or '.png'}") for stem, number in zip(stems, numbers, strict=True)]

@@ -246,6 +246,8 @@ def export(source: str | Path, out: str | Path, *, format_name: str | None = Non
     RsaError
         If the input cannot be read, the subject or the format is not known, or the file cannot be written.
     """
+    if Path(out).exists() and Path(out).samefile(Path(source)):
+        raise UsageError(f"{out}: this is the input, which holds more than the export; choose another name")
     given = read_markers(Path(source))
     series = {one.subject: one for one in make_series(_all_named(given), given.status)}
     chosen = next(iter(series)) if subject is None and len(series) == 1 else subject

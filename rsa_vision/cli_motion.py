@@ -101,5 +101,7 @@ def _finish(summary: MotionSummary, noun: str, file: str) -> None:
     if summary.unnamed:
         print(f"{summary.unnamed} markers without a segment were left out", file=sys.stderr)
     n = len(summary.table)
+    if not n:
+        print("nothing to compare: no subject has two examinations with the same segment or points", file=sys.stderr)
     counts = [f"{summary.count(status)} {status}" for status in ("ok", "review", "failed")] if "status" in summary.table.columns else []
     print(f"{n} {noun}{'s' if n != 1 else ''}{': ' if counts else ''}{', '.join(counts)} -> {summary.out / file}")

@@ -24,7 +24,8 @@ MOTION_REASONS: Final[dict[str, tuple[str, str]]] = {
     "exams-out-of-order": ("review", "by its name the later examination is the earlier one; look at the names"),
     "exam-order-unclear": (
         "review",
-        "names of examinations are dates with the day or month first: their order is not told; use yyyy-mm-dd",
+        "names of examinations do not tell their order (words, or dates with the day or month first);"
+        " use yyyy-mm-dd, or names that differ in numbers alone",
     ),
     "marker-missing": ("ok", "a marker has no coordinates in one of the examinations; the others were used"),
     "marker-predicted": ("ok", "a marker was placed by the known segment, not by rays; it was left out"),

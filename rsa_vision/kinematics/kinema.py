@@ -156,8 +156,8 @@ def _exam_codes(series: Sequence[Series], rows: _Rows, frames: Sequence[Float]) 
     a, b = (offset[rows.series] + end for end in rows.pair.T)
     lost = np.array([not np.isfinite(frame).all() for frame in frames], bool)[rows.series]
     early = np.where(days[b] < days[a], BIT["exams-out-of-order"], 0)
-    unclear = np.array([order_is_unclear(exam) for one in series for exam in one.exams], bool)
-    early |= np.where(unclear[a] | unclear[b], BIT["exam-order-unclear"], 0)
+    unclear = np.array([order_is_unclear(one.exams) for one in series], bool)[rows.series]
+    early |= np.where(unclear, BIT["exam-order-unclear"], 0)
     result: Int = state[a] | state[b] | early | np.where(lost, BIT["frame-undefined"], 0)
     return result
 

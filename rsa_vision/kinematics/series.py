@@ -140,9 +140,18 @@ def exam_time(exam: str) -> datetime | None:
         return None
 
 
-def order_is_unclear(exam: str) -> bool:
-    """Return whether the name of an examination is a date with the day or the month first: sorting does not bring it in order of time."""
-    return DAY_OR_MONTH_FIRST.fullmatch(exam) is not None
+def order_is_unclear(exams: Sequence[str]) -> bool:
+    """Return whether the names of a subject's examinations do not tell their order in time.
+
+    They do where all are times, single letters, or differ in numbers alone (``3m``, ``12m``; a letter more marks a repeat); dates with the
+    day or the month first do not, nor do words (``preop``, ``1y``, ``6m``).
+    """
+    if all(exam_time(exam) for exam in exams) or all(len(exam) == 1 for exam in exams):
+        return False
+    names = {exam.lower() for exam in exams}
+    repeats = {name for name in names if name[:-1] in names or f"{name[:-1]}a" in names}
+    frames = {re.sub(r"\d+", "0", name[:-1] if name in repeats else name) for name in names}
+    return len(exams) > 1 and (len(frames) > 1 or any(DAY_OR_MONTH_FIRST.fullmatch(exam) for exam in exams))
 
 
 def make_series(table: MarkerTable, status: Mapping[tuple[str, str], str] | None = None) -> tuple[Series, ...]:

@@ -131,3 +131,10 @@ def test_wrong_usage_is_refused(markers: Path, capsys: pytest.CaptureFixture[str
     out = markers.with_name("m.txt")
     assert run_app(["export", str(markers), "-o", str(out), "--subject", "S02", "--format", "trc"]) == 0
     assert len(read_trc(out)) == 8
+
+
+def test_the_input_is_not_written_over(markers: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = markers.read_bytes()
+    assert run_app(["export", str(markers), "-o", str(markers), "--format", "xmalab"]) == 2
+    assert "this is the input" in capsys.readouterr().err
+    assert markers.read_bytes() == before

@@ -9,7 +9,7 @@ from pytransform3d import transformations as pt
 from scipy.spatial.transform import Rotation
 
 from rsa_vision.flags import MarkerFlag
-from rsa_vision.kinematics.series import MarkerTable
+from rsa_vision.kinematics.series import MarkerTable, order_is_unclear
 from rsa_vision.settings import Limits
 
 from .bodies import analyse, exam_name, pick, subject, table, vector
@@ -255,3 +255,22 @@ def test_the_status_of_examinations_reaches_their_motions() -> None:
         found = motions(make_series(markers, {("S001", exam_name(1)): status}), Motion(), Limits())
         assert set(found["status"]) == {status}
         assert all(code in reasons.split(";") for reasons in found["reasons"])
+
+
+@pytest.mark.parametrize(
+    ("exams", "unclear"),
+    [
+        (("preop", "1y"), True),
+        (("1y", "6m"), True),
+        (("post", "3months", "1year"), True),
+        (("3/4/2026", "4/4/2026"), True),
+        (("6m", "12m", "12mb"), False),
+        (("1", "2", "2b"), False),
+        (("1a", "1b", "2a"), False),
+        (("A", "B"), False),
+        (("202601150900", "2026-02-15", "202602150900b"), False),
+        (("visit 2", "visit 10"), False),
+    ],
+)
+def test_names_that_do_not_tell_the_order_of_examinations_are_known(exams: tuple[str, ...], unclear: bool) -> None:
+    assert order_is_unclear(exams) is unclear
