@@ -30,6 +30,7 @@ MOTION_REASONS: Final[dict[str, tuple[str, str]]] = {
     "marker-missing": ("ok", "a marker has no coordinates in one of the examinations; the others were used"),
     "marker-predicted": ("ok", "a marker was placed by the known segment, not by rays; it was left out"),
     "marker-doubtful": ("ok", "a marker is flagged loose or ambiguous: it may have moved in its bone, or be another one; it was left out"),
+    "segments-together": ("ok", "lengths of several segments: what these moved against each other is in the lengths and the scale"),
     "screw-undefined": ("ok", "the rotation is zero within its error: no direction of the screw axis"),
     "sd-from-residuals": ("ok", "the input has no covariances: standard deviations come from the residuals"),
 }

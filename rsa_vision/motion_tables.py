@@ -160,7 +160,7 @@ def growth_tables(series: Sequence[Series], standard: Sequence[Series] | None, s
             errors = [np.stack([some[name][1] for name in common]) for some in (before, after)]
             found = compare_lengths(first * factor, second * scale, *errors)
             summary |= {"rmsv_um": found.rmsv_um, "s0_um": found.s0_um, "scale_ppm": found.scale_ppm, "form": found.form}
-            growth.append(key | summary | _growth_verdict(found.form, len(common), twice & {start, end}))
+            growth.append(key | summary | _growth_verdict(found.form, common, twice & {start, end}))
             for k, (i, j) in enumerate(zip(found.first, found.second, strict=True)):
                 ends = dict(zip(("segment_a", "marker_a", "segment_b", "marker_b"), (*common[i], *common[j]), strict=True))
                 numbers = {name: getattr(found, name)[k] for name in ("length_from_mm", "length_to_mm", "difference_um", "sd_um")}
@@ -168,10 +168,11 @@ def growth_tables(series: Sequence[Series], standard: Sequence[Series] | None, s
     return frame(lengths, LENGTHS), frame(growth, GROWTH)
 
 
-def _growth_verdict(form: str, n_points: int, twice: set[str]) -> Row:
+def _growth_verdict(form: str, common: Sequence[tuple[str, str]], twice: set[str]) -> Row:
     """Return status and reasons: lengths are the same in a mirror, so that only here it shows."""
     bits = (BIT["mirrored"] if form == "mirrored" else 0) | (BIT["marker-duplicate"] if twice else 0)
-    reasons = ["too-few-markers"] if n_points < 3 else []  # for a scale; the one length is determined
+    bits |= BIT["segments-together"] if len({segment for segment, _ in common}) > 1 else 0
+    reasons = ["too-few-markers"] if len(common) < 3 else []  # for a scale; the one length is determined
     return {"status": status_of(bits), "reasons": ";".join([*filter(None, [joined(bits)]), *reasons])}
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tomllib
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -110,9 +111,17 @@ def describe_validation(error: ValidationError) -> str:
     Returns
     -------
     str
-        Lines ``path: message``.
+        Lines ``path: message``; for a key that there is not, the one that is most like it.
     """
-    return "\n".join(f"  {'.'.join(map(str, item['loc'])) or '(whole file)'}: {item['msg']}" for item in error.errors())
+    return "\n".join(f"  {'.'.join(map(str, item['loc'])) or '(whole file)'}: {_message(dict(item))}" for item in error.errors())
+
+
+def _message(item: dict[str, Any]) -> str:
+    if item["type"] != "extra_forbidden":
+        return str(item["msg"])
+    tables: tuple[type[BaseModel], ...] = (Study, Limits, Motion)
+    like = get_close_matches(str(item["loc"][-1]), [key for table in tables for key in table.model_fields], 1)
+    return f"no such setting; is {like[0]} meant?" if like else "no such setting"
 
 
 def load_study(path: Path) -> Study:

@@ -239,7 +239,7 @@ def _other_readings(cage: Cage, told: _Reading) -> Iterator[_Reading]:
 
 def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImages, limits: Limits, log_room: float) -> CageIdentification:
     if not namings:
-        return answer.failed("no grid of fiducial marks with control points")
+        return answer.failed("no grid of its fiducial marks with control points: other cage, orientation or pixel pitch, or marks covered")
     possible = [n for n in namings if not impossible_stretch(n)]
     if not possible:
         return answer.failed(impossible_stretch(namings[0]))

@@ -243,6 +243,7 @@ def test_growth_of_a_rod_finds_its_scale_and_error(tmp_path: Path) -> None:
 def test_growth_between_two_times_has_stated_errors_that_are_true(markers: Path) -> None:
     rigid = rsa_vision.growth(markers).table
     assert len(rigid) == 4 * 3
+    assert set(rigid["reasons"]) == {"segments-together"}  # the stem's motion is no growth
     lengths = read(markers.with_name("lengths.csv")).filter(pl.col("segment_a") == pl.col("segment_b"))
     ratio = (lengths["difference_um"] / lengths["sd_um"]).to_numpy()
     assert 0.9 < np.sqrt((ratio**2).mean()) < 1.1
@@ -258,13 +259,13 @@ def test_growth_has_no_scale_for_a_mirror_image_and_says_which_markers_stand_twi
     assert run_app(["growth", str(tmp_path / "flipped.csv"), "-o", str(tmp_path / "flipped")]) == 1
     found = read(tmp_path / "flipped" / "growth.csv")
     mirrored = found.filter(pl.col("exam_to") == str(last))
-    assert set(mirrored["reasons"]) == {"mirrored"}
+    assert set(mirrored["reasons"]) == {"mirrored;segments-together"}
     assert mirrored["scale_ppm"].null_count() == mirrored["s0_um"].null_count() == len(mirrored)
     assert mirrored["rmsv_um"].null_count() == 0  # lengths are the same in a mirror
     assert set(found.filter(pl.col("exam_to") != str(last))["status"]) == {"ok"}
     pl.concat([table, table.filter(pl.col("exam") == last).head(1)]).write_csv(tmp_path / "twice.csv")
     assert run_app(["growth", str(tmp_path / "twice.csv"), "-o", str(tmp_path / "twice")]) == 1
-    assert "review (marker-duplicate)" in capsys.readouterr().out
+    assert "review (marker-duplicate;segments-together)" in capsys.readouterr().out
 
 
 def test_growth_of_points_in_one_place_is_not_determined(markers: Path, tmp_path: Path) -> None:
