@@ -240,5 +240,5 @@ def test_links_in_a_circle_fail_alone_and_the_run_ends_with_its_report(tmp_path:
 
 def test_a_mistyped_setting_is_named_with_the_one_that_is_meant(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text("pixel_pich_mm = 0.1\n[limits]\nposterier = 0.99\n")
-    with pytest.raises(rsa_vision.RsaError, match="posterior meant(.|\n)*pixel_pitch_mm meant"):
+    with pytest.raises(rsa_vision.RsaError, match=r"posterior meant(.|\n)*pixel_pitch_mm meant"):
         rsa_vision.measure(tmp_path, tmp_path / "out", study=tmp_path / "study.toml")
