@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
-from rsa_vision.detect.find import MISFIT, STRENGTH, first_look, misfit, significance_limit
+from rsa_vision.detect.find import MISFIT, STRENGTH, first_look, fit_at, misfit, plausible, significance_limit
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
@@ -33,7 +33,7 @@ STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which the
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
-_OF_A_TEE = 2.0  # evidence that the thick ends of a tee's arms may feign
+_OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +131,7 @@ def _one_polarity(
     )
     tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
+    tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]
     pins, pin_optics = find_pins(film, [p for p in rough_pins if np.sign(p.depth) == sign], tees, optics, noise)
 
     needles = [(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]
@@ -160,6 +161,20 @@ def _one_polarity(
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
     return evidence, Detection(images, sign < 0, optics, noise)
+
+
+def _are_rather_balls(film: NDArray[Any], tees: list[NeedleFit], seeds: BallFits, optics: Optics, noise: NoiseModel) -> list[bool]:
+    """Say which tees a ball over their tip explains better: three thick arms that run into each other make a disc."""
+    result = [False] * len(tees)
+    tips = np.array([t.position_px for t in tees]).reshape(-1, 2)
+    gap = np.hypot(*(tips[:, None] - seeds.position_px[None]).transpose(2, 0, 1))
+    tee, seed = np.nonzero(gap < seeds.radius_px[None] + 1)
+    if len(tee):
+        balls = fit_at(film, seeds.position_px[seed], seeds.radius_px[seed], optics, noise, quick=True)
+        as_ball = plausible(balls, noise) & (np.hypot(*(balls.position_px - tips[tee]).T) < balls.radius_px + 1)
+        for k in np.flatnonzero(as_ball):
+            result[tee[k]] |= bool(balls.chi2_core[k] < tees[tee[k]].chi2_core)
+    return result
 
 
 def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:

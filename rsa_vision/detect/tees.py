@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.crossing import fit_crossing
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
+from rsa_vision.detect.junctions import RINGS_PX
 from rsa_vision.detect.needle_sets import TAPERS, clusters, common_optics, fit_all, others_beside
 from rsa_vision.detect.needles import NeedleFit, NeedleShape, explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
@@ -23,6 +24,7 @@ ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness f
 _MOST_JUNCTIONS = 80
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _FAINTEST = 0.05  # of the depth of the film's clearest tee: a film linear in exposure has little of it behind thick tissue
+_LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _NEAREST_PX = 3.0  # two tips nearer than this are one
 _MOST_PARALLEL = 24  # of those, the ones looked at
 _OUTLYING = 3.0  # standard deviations from which a direction is an error
@@ -106,7 +108,7 @@ def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
         return False
     turn = np.angle(np.exp(1j * (fit.angles - fit.angles[0])))
     square = abs(turn[1] - np.pi / 2) < 0.35 and abs(turn[2] + np.pi / 2) < 0.35
-    slim = fit.shape.length_px > 2.0 * fit.shape.half_width_px
+    slim = fit.shape.length_px > 2.0 * fit.shape.half_width_px and fit.shape.length_px > RINGS_PX[0] and fit.n_core > _LEAST_PIXELS
     return bool(square and slim and fit.misfit < 1.3 * MISFIT * slack and explains(fit, 1 - (1 - EXPLAINED) * slack))
 
 

@@ -1,0 +1,22 @@
+"""What may pass for a tee, and what may not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rsa_vision.detect.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.tees import is_tee
+
+
+def test_arms_of_a_few_pixels_are_no_tee() -> None:
+    quarter = np.pi / 2
+    shape = NeedleShape(2.0, 16.0)
+    fit = NeedleFit(
+        np.zeros(2), np.array([0.0, quarter, -quarter]), shape, np.full(3, -900.0), -900.0, 4e4, np.eye(2) * 1e-4, 190, 1.0, 1.0, 0.98, 1.0,
+        0.0, 80.0, True,
+    )  # fmt: skip
+    assert is_tee(fit)
+    assert not is_tee(replace(fit, n_core=10))  # within a ball three short arms explain all of their ten pixels
+    assert not is_tee(replace(fit, shape=NeedleShape(1.6, 5.2)))
