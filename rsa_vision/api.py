@@ -9,19 +9,18 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from rsa_vision.api_detect import detect
 from rsa_vision.api_motion import export, growth, motion, precision, write_motion
 from rsa_vision.batch import Outcome, Task, run
-from rsa_vision.errors import FilmError, UsageError
+from rsa_vision.errors import UsageError
+from rsa_vision.ordering import natural_key
 from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
 from rsa_vision.provenance import environment, file_sha256
 from rsa_vision.segments import Segments, read_segments
 from rsa_vision.settings import Study
-from rsa_vision.store import parquet_bytes, to_csv, write_atomic, write_run, write_tables
-from rsa_vision.study_files import natural_key
+from rsa_vision.store import write_atomic, write_run, write_tables
 
 if TYPE_CHECKING:
-    import polars as pl
-
     from rsa_vision.proposal import Proposal
 __all__ = [
     "Summary",
@@ -223,77 +222,6 @@ def reconstruct(
     return Summary(out, tuple(outcomes))
 
 
-def detect(
-    images: Sequence[str | Path],
-    out: str | Path | None = None,
-    *,
-    overlay: str | Path | None = None,
-    response: str = "auto",
-    failures: list[tuple[Path, str]] | None = None,
-    watch: Callable[[Path, int], None] | None = None,
-) -> pl.DataFrame:
-    """Find the marker images of single films; no cage and no pixel pitch is needed.
-
-    Parameters
-    ----------
-    images : sequence of path
-    out : path, optional
-        CSV file for the result.
-    overlay : path, optional
-        PNG file for a drawing; with several images the name of each is added to it.
-    response : str
-        Film response, as in the study file.
-    failures : list, optional
-        Films that cannot be used are added to it as (path, message); without it the first one is raised.
-    watch : callable, optional
-        Is called after every film with its path and the number of markers found, -1 where it failed.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns file, shape, col_px, row_px, sd_col_px, sd_row_px, cov_col_row_px2, radius_px, angle_deg, contrast, snr, flags.
-
-    Raises
-    ------
-    FilmError
-        If a film cannot be used and there is no list of failures.
-    SettingsError
-        If the response is unknown.
-    UsageError
-        If no image is given, or a result cannot be written.
-    """
-    from rsa_vision.detect import detect_markers
-    from rsa_vision.images import read_film
-    from rsa_vision.overlay import overlay_png
-    from rsa_vision.tables import DETECTIONS, detection_rows, frame
-
-    if not images:
-        raise UsageError("no image given; name the films to look at")
-    settle(None, {"response": response})  # refuses an unknown one
-    drawings = [] if overlay is None else _overlay_paths(Path(overlay), [Path(name) for name in images])
-    rows: list[dict[str, Any]] = []
-    for number, name in enumerate(images):
-        try:
-            film = read_film(Path(name))
-            found = detect_markers(film.values, bits=film.bits, response=response).images
-        except FilmError as error:
-            if failures is None:
-                raise
-            failures.append((Path(name), str(error)))
-            if watch:
-                watch(Path(name), -1)
-            continue
-        rows += detection_rows(str(name), found)
-        if drawings:
-            write_atomic(drawings[number], overlay_png(film.values, found))
-        if watch:
-            watch(Path(name), len(found))
-    table = frame(rows, DETECTIONS)
-    if out is not None:
-        write_atomic(Path(out), parquet_bytes(table) if Path(out).suffix == ".parquet" else to_csv(table))
-    return table
-
-
 def report(out: str | Path) -> Path:
     """Write ``report.html`` of a results folder again and return its path; :class:`UsageError` if there are no results."""
     from rsa_vision.report import write_report
@@ -410,12 +338,3 @@ def _finish(out: Path, record: Mapping[str, Any]) -> None:
 
     write_run(out, {**record, "end": datetime.now(UTC).isoformat(timespec="milliseconds")})
     write_report(out)
-
-
-def _overlay_paths(overlay: Path, images: Sequence[Path]) -> list[Path]:
-    """One for each image, told apart by the image's name, and by a number where names are the same."""
-    if len(images) == 1:
-        return [overlay]
-    stems = [f"{overlay.stem}_{image.stem}" for image in images]
-    numbers = [f"_{stems[:k].count(stem) + 1}" if stems.count(stem) > 1 else "" for k, stem in enumerate(stems)]
-    return [overlay.with_name(f"{stem}{number}{overlay.suffix or '.png'}") for stem, number in zip(stems, numbers, strict=True)]

@@ -141,7 +141,7 @@ def measure(
 @app.command()
 def detect(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Films.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="CSV file for the result.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File for the result: CSV, or Parquet (.parquet).")],
     overlay: Annotated[Path | None, typer.Option("--overlay", help="PNG file for a drawing of what was found.")] = None,
     response: Annotated[str, typer.Option("--response", help="auto, density, transmission, linear or log.")] = "auto",
 ) -> int:

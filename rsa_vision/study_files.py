@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from rsa_vision.errors import SettingsError, UsageError
+from rsa_vision.ordering import natural_key
 from rsa_vision.settings import FilmMode
 
 FILM_SUFFIXES: Final = frozenset({".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".dcm", ".dicom", ".ima"})
@@ -45,11 +46,6 @@ class Grouping:
 
     exams: tuple[ExamFiles, ...]
     ignored: tuple[tuple[Path, str], ...]
-
-
-def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
-    """Return a key that sorts numbers in text by their value (``9`` before ``10`` before ``10b``)."""
-    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", text))
 
 
 def printable(name: str) -> str:

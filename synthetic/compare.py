@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -96,11 +96,6 @@ def compare(truth: Path, measured: Path, *, match_mm: float = 1.0, match_px: flo
         got = {name: table.filter(here) for name, table in tables.items()}
         results.append(_compare_exam(subject, exam, want, got, match_mm, match_px))
     return tuple(results)
-
-
-def as_table(comparisons: tuple[ExamComparison, ...]) -> pl.DataFrame:
-    """Return comparisons as a table, one row each."""
-    return pl.DataFrame([{f.name: getattr(c, f.name) for f in fields(c)} for c in comparisons])
 
 
 def match_points(true_mm: Float, found_mm: Float, limit_mm: float) -> tuple[list[int], list[int]]:

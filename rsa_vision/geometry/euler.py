@@ -34,17 +34,6 @@ def euler_from_matrix(rotation: Float) -> Float:
     return angles + 0.0  # no "-0"
 
 
-def matrix_from_euler(angles_rad: Float) -> Float:
-    """Return the rotations of angles phi, psi, theta: shape (..., 3) to (..., 3, 3), Selvik (6:6)."""
-    (sin_x, sin_y, sin_z), (cos_x, cos_y, cos_z) = np.moveaxis(np.sin(angles_rad), -1, 0), np.moveaxis(np.cos(angles_rad), -1, 0)
-    rows = [
-        [cos_y * cos_z, -cos_y * sin_z, sin_y],
-        [sin_x * sin_y * cos_z + cos_x * sin_z, -sin_x * sin_y * sin_z + cos_x * cos_z, -sin_x * cos_y],
-        [-cos_x * sin_y * cos_z + sin_x * sin_z, cos_x * sin_y * sin_z + sin_x * cos_z, cos_x * cos_y],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def euler_jacobian(angles_rad: Float) -> Float:
     """Return the derivative of the angles by a small further rotation about the axes of the fixed frame.
 

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from rsa_vision.flags import MarkerFlag
+from rsa_vision.ordering import natural_key
 from rsa_vision.types import Bool, Float, Int, Str, Table
 
 CENTURY: Final = 70  # two-figure years from here on are of the 20th century (Selvik's numbers of ten figures)
@@ -108,12 +109,6 @@ class Series:
 
 
 @lru_cache(maxsize=65536)
-def natural(text: str) -> tuple[tuple[int, int, str], ...]:
-    """Return a key that sorts numbers in text by their value."""
-    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", text))
-
-
-@lru_cache(maxsize=65536)
 def exam_time(exam: str) -> datetime | None:
     """Return the time that the name of an examination tells, or None.
 
@@ -179,7 +174,7 @@ def make_series(table: MarkerTable, status: Mapping[tuple[str, str], str] | None
         exams.setdefault(subject, set()).add(exam)
         if segment:
             rows.setdefault(subject, {}).setdefault(segment, []).append(i)
-    return tuple(_one_series(table, subject, exams[subject], rows.get(subject, {}), known) for subject in sorted(exams, key=natural))
+    return tuple(_one_series(table, subject, exams[subject], rows.get(subject, {}), known) for subject in sorted(exams, key=natural_key))
 
 
 def _one_series(
@@ -187,12 +182,12 @@ def _one_series(
 ) -> Series:
     times = {exam: exam_time(exam) for exam in exams}
     if all(times.values()):
-        ordered = tuple(sorted(exams, key=lambda exam: (times[exam], natural(exam))))
+        ordered = tuple(sorted(exams, key=lambda exam: (times[exam], natural_key(exam))))
     else:
-        ordered = tuple(sorted(exams, key=natural))
+        ordered = tuple(sorted(exams, key=natural_key))
     first = times[ordered[0]]
     days = [(time - first).total_seconds() / DAY_S if first and (time := times[exam]) else np.nan for exam in ordered]
-    segments = tuple(_segment(table, name, rows[name], ordered) for name in sorted(rows, key=natural))
+    segments = tuple(_segment(table, name, rows[name], ordered) for name in sorted(rows, key=natural_key))
     states = tuple(status.get((subject, exam), "ok") for exam in ordered)
     return Series(subject, ordered, np.array(days), _repeats(ordered), segments, states)
 
@@ -214,7 +209,7 @@ def _segment(table: MarkerTable, name: str, rows: Sequence[int], exams: Sequence
     at = np.array(rows)
     place = {exam: index for index, exam in enumerate(exams)}
     labels = table.marker[at].tolist()
-    markers = tuple(sorted(set(labels), key=natural))
+    markers = tuple(sorted(set(labels), key=natural_key))
     column = {marker: index for index, marker in enumerate(markers)}
     e = np.array([place[exam] for exam in table.exam[at].tolist()])
     m = np.array([column[label] for label in labels])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import time
@@ -186,3 +187,14 @@ def test_ctrl_c_says_that_the_same_command_goes_on(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("rsa_vision.api.measure", interrupted)
     assert run_app(["measure", "a", "-o", "b"]) == 130
     assert "goes on" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("two_images")
+def test_films_of_one_name_have_drawings_of_their_own_and_parquet_is_parquet(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    film = sorted(folder.glob("*_f1.tif"))[0]
+    same = shutil.copy(film, tmp_path / "other" / film.name)
+    out = tmp_path / "found.parquet"
+    assert run_app(["detect", str(film), str(same), "-o", str(out), "--overlay", str(tmp_path / "seen.png")]) == 0
+    assert len(pl.read_parquet(out)) == 4
+    assert sorted(path.name for path in tmp_path.glob("seen*")) == [f"seen_{film.stem}_{k}.png" for k in (1, 2)]
