@@ -292,7 +292,7 @@ def test_table_18_has_more_than_image_errors_and_a_film_that_hangs_through_gives
         if printed > most
     }
     assert beyond == {(pair, name) for pair in PAIRS for name in ("rx_deg", "tx_mm", "tz_mm")}
-    # his own explanation. It gives rx and tz between the ends; tx is still open
+    # his own explanation; the depth is chosen. It reaches rx and tz between the ends, not between the middle segments, and gives no tx
     bent = largest(plates(POSITIONS, {}, 1, 20, hanging), ("1", "4"), 1)[0]
     assert bent[0] > TABLE_18["1", "4"][0]
     assert bent[5] > TABLE_18["1", "4"][5]
