@@ -101,7 +101,7 @@ class FilmTruth:
         single = [i for i, source in enumerate(self.source) if len(source) == 4 and source[:2] == ("mark", focus)]
         width = WIDER * 2 * self.images.radius_px
         near = {i for i in single if (np.hypot(*(unseen - self.place_px[self.source[i][1:4]]).T) < width[i]).any()}
-        return {self.source[i][2:4] for i in single if i not in near}  # type: ignore[misc]  # role and number
+        return {self.source[i][2:4] for i in single if i not in near}
 
     def in_line(self, cage: Cage, focus: int) -> bool:
         """Return whether the fiducial marks that a focus shows are nearly on a line: three times nearer to it than those of the cage."""
