@@ -26,6 +26,7 @@ bench: $(STAMP)  ## hours: marker images against the bound, whole examinations a
 	$(BIN)/python benchmarks/detection.py
 	$(BIN)/python benchmarks/reach.py
 	$(BIN)/python benchmarks/identification.py
+	$(BIN)/python benchmarks/pair_calibration.py
 	$(BIN)/python benchmarks/hard_films.py
 
 lock:  ## renew requirements.lock (hashes, no addresses)

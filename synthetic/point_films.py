@@ -18,6 +18,7 @@ Source = tuple[Any, ...]
 
 NEVER: Final = 1e9
 LIKELY_SIGMA: Final = 6.0
+WIDER: Final = 1.15  # images of control points are wider than those of fiducial marks, by their height: discs that touch may be one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +90,18 @@ class FilmTruth:
         """Return how many marks of a focus have an image."""
         names = {tuple(one[1:4]) for source in self.source for one in (source[:4], *source[4:]) if one[0] == "mark"}
         return sum(name[:2] == (focus, role) for name in names)
+
+    def alone(self, focus: int) -> set[tuple[str, int]]:
+        """Return role and number of the marks of a focus that have an image of their own.
+
+        Not melted with another, nor so near to where a mark without an image should show one that nobody could tell.
+        """
+        shown = {tuple(one[1:4]) for source in self.source for one in (source[:4], *source[4:])}
+        unseen = np.array([place for name, place in self.place_px.items() if name not in shown and name[1] != "object"]).reshape(-1, 2)
+        single = [i for i, source in enumerate(self.source) if len(source) == 4 and source[:2] == ("mark", focus)]
+        width = WIDER * 2 * self.images.radius_px
+        near = {i for i in single if (np.hypot(*(unseen - self.place_px[self.source[i][1:4]]).T) < width[i]).any()}
+        return {self.source[i][2:4] for i in single if i not in near}
 
     def in_line(self, cage: Cage, focus: int) -> bool:
         """Return whether the fiducial marks that a focus shows are nearly on a line: three times nearer to it than those of the cage."""

@@ -193,6 +193,11 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
         complete = any((naming.image[scene.own] >= 0).mean() > enough_for_all for naming in namings)
         if namings and not complete:
             best = max(namings, key=lambda n: n.log_evidence)
+            # once more from where it settled: what drew a focus aside at first, and kept its marks from their images, may do so no longer
+            again = name_marks(scene, best.fit.parameters, seen, log_room)
+            if again and again.log_evidence > best.log_evidence:
+                namings.append(again)
+                best = again
             _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters, limits))
         enough = any((naming.image[scene.own] >= 0).mean() > HALF for naming in namings)
         if enough or not misread or among.all():

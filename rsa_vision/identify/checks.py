@@ -14,7 +14,8 @@ from rsa_vision.types import Float
 
 LOG_FAR: Final = 7.0  # a focus beyond the limit is that much less likely
 FOUND: Final = 0.55  # of the fiducial marks and of the control points of a focus must be named: no single row of a cage of two
-SPREAD: Final = 0.3  # of the cage's own breadth must be left to the named ones
+SPREAD: Final = 0.3  # of the breadth of the cage's own fiducial marks must be left to the named ones
+FIXED_MM: Final = 10.0  # sd of a focus along any axis: a tenth of what is presumed of it, its control points fix it and not the presumption
 STRETCH: Final = 0.017  # largest half anisotropy and shear of a film, 2 % each; cages 1B and 1B-420 differ by 0.025
 AGREEING: Final = 0.5  # of the named images must have the shape, and of the tees the direction, of their marks
 TURNED_DEG: Final = 25.0
@@ -34,16 +35,18 @@ def are_different(scene: Scene, a: Naming, b: Naming) -> bool:
 
 
 def what_is_missing(scene: Scene, naming: Naming) -> str:
-    """Return in words which marks are too few or too close to a line, else nothing."""
+    """Return in words which marks are too few, or do not fix the plane or a focus, else nothing."""
     for k, focus in enumerate(scene.foci):
         for fiducial, least, name in ((True, 4, "fiducial marks"), (False, 2, "control points")):
             wanted = scene.own & (scene.focus == k) & (scene.fiducial == fiducial)
             seen = int((naming.image[wanted] >= 0).sum())
             if seen < max(least, np.ceil(FOUND * wanted.sum())):
                 return f"only {seen} of {wanted.sum()} {name} of focus {focus}"
-            breadth, word = (_breadth, "in line") if fiducial else (_extent, "in one place")  # two points fix a focus, no line a plane
-            if breadth(scene.xyz_mm[wanted & (naming.image >= 0)]) < SPREAD * breadth(scene.xyz_mm[wanted]):
-                return f"the {name} found of focus {focus} lie nearly {word}"
+            if fiducial and _breadth(scene.xyz_mm[wanted & (naming.image >= 0)]) < SPREAD * _breadth(scene.xyz_mm[wanted]):
+                return f"the {name} found of focus {focus} lie nearly in line"
+        place = slice(FILM + 3 * k, FILM + 3 * k + 3)
+        if np.linalg.eigvalsh(naming.fit.covariance[place, place])[-1] > FIXED_MM**2:  # two points fix a focus unless they lie in one place
+            return f"the control points found of focus {focus} lie too close together"
     return ""
 
 
@@ -51,11 +54,6 @@ def _breadth(points: Float) -> float:
     """Return the root mean square distance of points from their best line."""
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(np.linalg.norm(singular[1:]) / np.sqrt(len(points)))
-
-
-def _extent(points: Float) -> float:
-    """Return the root mean square distance of points from their middle."""
-    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def impossible_stretch(naming: Naming) -> str:

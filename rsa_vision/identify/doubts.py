@@ -72,11 +72,10 @@ def without(scene: Scene, naming: Naming, images: FilmImages, rows: list[int], l
     image = naming.image.copy()
     image[rows] = -1
     left = np.flatnonzero(image >= 0)
-    slack = naming.slack_mm
     try:
-        for _ in range(2):
-            fitted = fit_rows(scene, naming.fit.parameters, left, image, images, slack)
-            slack = residual_slack(fitted, images.covariance_mm2[image[left]], slack)
+        fitted = fit_rows(scene, naming.fit.parameters, left, image, images, naming.slack_mm)
+        slack = residual_slack(fitted, images.covariance_mm2[image[left]], naming.slack_mm)
+        fitted = fit_rows(scene, fitted.parameters, left, image, images, slack)
     except np.linalg.LinAlgError:
         return None
     looks = appearance(scene, fitted.parameters, images)

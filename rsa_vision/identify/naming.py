@@ -42,6 +42,7 @@ class Naming:
     fit : Fit
         Of the rows with an image, in their order.
     slack_mm : float
+        With which the fit was weighed: what its covariance leaves of an image's own is exact, also of one that alone fixes a parameter.
     log_evidence : float
         Against clutter only.
     dropped : tuple of (int, int)
@@ -159,7 +160,7 @@ def name_marks(
     """
     parameters = start
     image = np.full(len(scene.mark), -1)
-    slack = STAGES_MM[0]
+    slack = fitted_with = STAGES_MM[0]
     fitted: Fit | None = None
     looks = appearance(scene, start, images)
     for stage in (*STAGES_MM, *[None] * SETTLING):
@@ -179,7 +180,7 @@ def name_marks(
         image = named
         rows = np.flatnonzero(image >= 0)
         try:
-            fitted = fit_rows(scene, parameters, rows, image, images, slack)
+            fitted, fitted_with = fit_rows(scene, parameters, rows, image, images, slack), slack
             if stage != STAGES_MM[0]:
                 slack = residual_slack(fitted, images.covariance_mm2[image[rows]], slack)
         except np.linalg.LinAlgError:
@@ -193,7 +194,7 @@ def name_marks(
     if fitted is None or parameters[6] + 3 * np.sqrt(fitted.covariance[6, 6]) < LEAST_GAP_MM:
         return None
     looks = appearance(scene, parameters, images)
-    return evidence(scene, Naming(image, fitted, slack, 0.0), images, looks, log_room)
+    return evidence(scene, Naming(image, fitted, fitted_with, 0.0), images, looks, log_room)
 
 
 def fit_rows(scene: Scene, start: Float, rows: Int, image: Int, images: FilmImages, slack_mm: float) -> Fit:

@@ -7,7 +7,7 @@ show. Logarithms of size and contrast are used throughout, so that a shift is a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -24,6 +24,7 @@ WIDE: Final = np.array([0.7, 0.7])  # sd of sizes and contrasts of any images
 HIDDEN: Final = (0.5, 10.0)  # markers that one focus does not show, of all: a guess of one in twenty, which weighs like ten markers
 UNKNOWN: Final = 2.0  # images that look like anything, which are presumed beside those at hand
 UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one image, a film's toe), of all: as HIDDEN
+NEW_KIND: Final = (0.5, 10.0)  # markers of a size or contrast that no other has, of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
 UNSURE: Final = np.array([0.2, 0.4])  # error of the logs of size and contrast of an image that is not clear
 FAINT: Final = 1e-3  # pairs less probable than that teach nothing
@@ -59,11 +60,31 @@ class Looks:
     @property
     def unsure(self) -> Float:
         """Error of the look of every ray, shape (n, 2)."""
-        result: Float = np.where((self.quality > 0)[:, None], UNSURE, 0.0)
+        result: Float = np.where((self.quality > 0)[:, None], UNSURE[: self.of_ray.shape[1]], 0.0)
         return result
 
+    @property
+    def sizes(self) -> Looks:
+        """The same without contrast."""
+        return replace(self, of_ray=self.of_ray[:, :1])
 
-def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
+    def as_usual_here(self, pair: Float) -> Looks:
+        """Take disturbed images for clear ones where too few pairs are clear to teach: on saturated films all look like that.
+
+        Parameters
+        ----------
+        pair : ndarray of shape (m,)
+            Probability of every crossing to be a marker, so far.
+
+        Returns
+        -------
+        Looks
+        """
+        clear = (self.quality[self.a] == 0) & (self.quality[self.b] == 0)
+        return self if pair[clear].sum() >= LEARNT_FROM else replace(self, quality=np.maximum(self.quality - 1, 0))
+
+
+def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone, alone_by_size: Alone) -> Float:
     """Return the log likelihood ratio of what the images of crossings look like: one marker, against two images without partners.
 
     Parameters
@@ -72,6 +93,8 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
     pair : ndarray of shape (m,)
         Probability of every crossing to be a marker, so far.
     alone : Alone
+    alone_by_size : Alone
+        Of the sizes only.
 
     Returns
     -------
@@ -80,8 +103,22 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
 
     Notes
     -----
-    Two images of different markers need no place in this ratio: the assignments that give each its own partner speak against theirs.
+    Two images of different markers need no place in this ratio: the assignments that give each its own partner speak against theirs. A pair
+    that does not look like one may still do so in size: bone before one image, or another exposure, changes its contrast only.
     """
+    like, unlike = _log_like(looks, pair, alone)
+    like_in_size, unlike_in_size = _log_like(looks.sizes, pair, alone_by_size)
+    share = (UNLIKE[0] / 2 + unlike_in_size) / (UNLIKE[0] + np.maximum(unlike, unlike_in_size))  # of the pairs unlike in either
+    taught = float(pair.sum())
+    part = (UNLIKE[0] + unlike) / (UNLIKE[1] + taught)
+    rest = np.logaddexp(np.log1p(-share) + like_in_size, np.log(share))
+    result: Float = np.logaddexp(np.log1p(-part) + like, np.log(part) + rest)
+    return result
+
+
+def _log_like(looks: Looks, pair: Float, alone: Alone) -> tuple[Float, Float]:
+    """Return the log likelihood ratio of pairs that look like one, and how many of the teachers of each do not; zeros if none taught."""
+    d = looks.of_ray.shape[1]
     first, second = looks.of_ray[looks.a].copy(), looks.of_ray[looks.b].copy()
     first[:, 0] += looks.grown_a
     second[:, 0] += looks.grown_b
@@ -96,7 +133,7 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
     unsure = np.hypot(weight_a * unsure_a, weight_b * unsure_b) / both
     of_pair = np.column_stack([mean, first - second])
     teachers = np.flatnonzero(known_a & known_b & ~unsure_a.any(axis=1) & ~unsure_b.any(axis=1) & (pair > FAINT))
-    result = np.zeros(len(pair))
+    result, unlike = np.zeros(len(pair)), np.zeros(len(pair))
     for e in np.flatnonzero(known_a | known_b):
         free = teachers[(looks.a[teachers] != looks.a[e]) & (looks.b[teachers] != looks.b[e])]
         weight = pair[free]
@@ -106,19 +143,21 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone) -> Float:
         ratios = first[free] - second[free]
         middle = _weighted_median(ratios, weight)
         deviation = np.abs(ratios - middle)
-        spread = np.maximum(1.4826 * _weighted_median(deviation, weight), LEAST)
-        spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL**2) / (n + USUAL_COUNT))
-        unlike = (UNLIKE[0] + weight[(deviation > FAR * spread).any(axis=1)].sum()) / (UNLIKE[1] + n)
-        marker = log_kernels(mean[e], mean[free], weight, np.hypot(np.hypot(KIND, unsure[e]), spread / 2), n)
+        spread = np.maximum(1.4826 * _weighted_median(deviation, weight), LEAST[:d])
+        spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL[:d] ** 2) / (n + USUAL_COUNT))
+        unlike[e] = weight[(deviation > FAR * spread).any(axis=1)].sum()
+        new, wide = NEW_KIND[0] / (NEW_KIND[1] + n), np.hypot(WIDE[:d], unsure[e])
+        of_new = float((log_student((mean[e] - _weighted_median(mean[free], weight)) / wide, 3.0) - np.log(wide)).sum())
+        of_known = log_kernels(mean[e], mean[free], weight, np.hypot(np.hypot(KIND[:d], unsure[e]), spread / 2), n)
+        marker = float(np.logaddexp(np.log1p(-new) + of_known, np.log(new) + of_new))
         if known_a[e] and known_b[e]:
             wider = np.hypot(spread * np.sqrt(1 + 1 / n), np.hypot(unsure_a[e], unsure_b[e]))
             marker += float((log_student((first[e] - second[e] - middle) / wider, min(n, 4.0)) - np.log(wider)).sum())
             # where two exposures lap on a film, contrasts come in sorts: as likely, a pair looks like one of the other pairs
-            width = np.hypot([*KIND, *np.minimum(spread, USUAL)], [*unsure[e], *np.hypot(unsure_a[e], unsure_b[e])])
+            width = np.hypot([*KIND[:d], *np.minimum(spread, USUAL[:d])], [*unsure[e], *np.hypot(unsure_a[e], unsure_b[e])])
             marker = np.logaddexp(marker, log_kernels(of_pair[e], of_pair[free], weight, width, n)) - np.log(2)
-        like = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
-        result[e] = np.logaddexp(np.log1p(-unlike) + like, np.log(unlike))
-    return result
+        result[e] = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
+    return result, unlike
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +195,7 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     _, one = np.unique(looks.image, return_index=True)  # on a shared film an image has several rays
     single, pairs = 1 - paired[one], float(paired[one].sum()) / 2
     quality, value, unsure = looks.quality[one], looks.of_ray[one], looks.unsure[one]
+    wide, kind = WIDE[: value.shape[1]], KIND[: value.shape[1]]
     known: Bool = np.array(np.isfinite(value).all(axis=1))
     clear = known & (quality == 0)
     density = np.zeros(len(looks.of_ray))
@@ -163,11 +203,11 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
         return Alone(density, density.copy(), _hidden(float(single.sum()), pairs))
     middle = _weighted_median(value[clear], np.ones(int(clear.sum())))
     of_pairs = np.where(clear, np.maximum(paired[one], 1e-9), 0.0)
-    broad = (log_student((value - middle) / np.hypot(WIDE, unsure), 3.0) - np.log(np.hypot(WIDE, unsure))).sum(axis=1)
+    broad = (log_student((value - middle) / np.hypot(wide, unsure), 3.0) - np.log(np.hypot(wide, unsure))).sum(axis=1)
     shares = _shares(quality, paired[one])
     odds = np.log(CLASSES * shares)[quality]
     odds[known] += [
-        log_kernels(value[k], value[clear], of_pairs[clear], np.hypot(KIND, unsure[k]), 2 * pairs) for k in np.flatnonzero(known)
+        log_kernels(value[k], value[clear], of_pairs[clear], np.hypot(kind, unsure[k]), 2 * pairs) for k in np.flatnonzero(known)
     ]
     odds[known] -= broad[known]
     hidden = _hidden(float(single @ expit(odds)), pairs)
@@ -177,7 +217,7 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
         alike = known & ((quality == 0) == (quality[k] == 0))
         others, unknown = np.arange(len(one)) != k, UNKNOWN * (1 if quality[k] == 0 else CLASSES - 1) / CLASSES
         markers = presumed * float(shares[0] if quality[k] == 0 else 1 - shares[0])
-        weights, widths = (np.where(alike & others, single, 0.0), np.where(clear & others, of_pairs, 0.0)), np.hypot(KIND, unsure[k])
+        weights, widths = (np.where(alike & others, single, 0.0), np.where(clear & others, of_pairs, 0.0)), np.hypot(kind, unsure[k])
         parts = [np.log(unknown) + broad[k]]
         if weights[0].sum() > 0:
             n = float(weights[0].sum())

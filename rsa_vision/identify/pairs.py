@@ -99,7 +99,7 @@ def pair_rays(
     slack = common_error(crossings) if slack_mm is None else slack_mm
     crossings = crossings.with_slack(slack)
     crossings = crossings.rows(crossings.distance_mm < limits.crossing_sigma * crossings.sigma_mm)
-    looks = _looks(bundle, crossings, radius_mm, contrast, quality)
+    known = _looks(bundle, crossings, radius_mm, contrast, quality)
     foci = len(np.unique(bundle.focus))
     groups, share, membership = _groups(bundle, crossings, foci)
     claims = [tuple(sorted(set(bundle.image[list(group)].tolist()))) for group in groups]
@@ -116,9 +116,11 @@ def pair_rays(
         for claim, probability in zip(claims, posterior, strict=True):
             paired[list(claim)] += probability
         of_ray = paired[bundle.image].clip(0, 1)
+        of_crossing = posterior @ (membership > 0)
+        looks = known.as_usual_here(of_crossing)
         alone = images_alone(looks, of_ray)
         crossings = crossings.among(neighbours, (1 - of_ray) + alone.hidden * of_ray)
-        look, of_quality = log_odds_of_looks(looks, posterior @ (membership > 0), alone), alone.log_quality
+        look, of_quality = log_odds_of_looks(looks, of_crossing, alone, images_alone(looks.sizes, of_ray)), alone.log_quality
     return _pairing(bundle, crossings, groups, membership, packing, images, limits, slack)
 
 

@@ -377,3 +377,37 @@ def test_three_of_eight_control_points_may_be_covered() -> None:
         assert result, f"seed {seed}"
         assert "cage-ambiguous" not in result.reasons
         assert film.errors(result.assignments) == []
+
+
+def cage_with(fiducials: int, controls: list[tuple[float, float]]) -> Cage:
+    corners = [m for m in small_cage(2).mark if m.role == "fiducial"]
+    more = [(10.0, 20.0), (-20.0, 110.0), (40.0, 120.0), (5.0, 190.0), (-75.0, 90.0), (85.0, 100.0)][: fiducials - 4]
+    added = [Mark(number=21 + i, role="fiducial", foci=(1,), shape="ball", xyz=(x, y, 0.0), diameter=0.8) for i, (x, y) in enumerate(more)]
+    added += [
+        Mark(number=11 + i, role="control", foci=(1,), shape="ball", xyz=(x, y, 160.0), diameter=0.8) for i, (x, y) in enumerate(controls)
+    ]
+    return small_cage(2).model_copy(update={"mark": (*corners, *added)})
+
+
+def test_image_that_alone_fixes_a_parameter_is_no_gross_error() -> None:
+    cage = cage_with(9, [(-40.0, 30.0), (45.0, 160.0)])
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        film = expose(cage, (1,), random_exposure(rng, cage, missing=0, false_images=0, objects=0, foci_mm=random_foci(cage, rng, 30)), rng)
+        result = identify(film, cage, (1,))
+        assert result, f"seed {seed}: {result.runner_up}"
+        assert result.dropped == (), f"seed {seed}"
+
+
+@pytest.mark.parametrize(("apart_mm", "found"), [(25.0, True), (2.0, False)])
+def test_control_points_must_fix_the_focus_wherever_the_others_stood(apart_mm: float, found: bool) -> None:
+    cage = cage_with(9, [(-70.0, 10.0), (45.0, 160.0), (45.0, 160.0 + apart_mm)])
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        exposure = random_exposure(rng, cage, missing=0, false_images=5, noise_px=0.05, slack_mm=0.0, foci_mm=random_foci(cage, rng, 30))
+        film = expose(cage, (1,), exposure, rng)
+        rows = np.array([source[2:4] != ("control", 11) for source in film.source])
+        seen = replace(film, images=film.images.rows(rows), source=[s for s, keep in zip(film.source, rows, strict=True) if keep])
+        result = identify(seen, cage, (1,))
+        assert bool(result) == found, f"seed {seed}: {result.runner_up}"
+        assert seen.errors(result.assignments) == []

@@ -15,6 +15,7 @@ from scipy.stats import poisson
 
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.packing import pack
+from rsa_vision.identify.pair_looks import Looks, images_alone, log_odds_of_looks
 from rsa_vision.identify.pairs import Pairing, pair_rays
 
 EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "60"))
@@ -320,3 +321,50 @@ def test_a_marker_with_bone_before_one_image_is_paired() -> None:
         pairing = rays.pair()
         assert not pairing.reasons, f"seed {seed}"
         assert all(rays.right(group) for group in pairing.groups)
+
+
+def test_images_that_all_are_disturbed_teach_as_clear_ones_do() -> None:
+    rng = np.random.default_rng(4)
+    rays = rays_to(some_markers(10, rng), rng, hidden=1, false=6)
+    zero = np.zeros(len(rays.bundle), int)
+    clear, saturated = rays.pair(quality=zero), rays.pair(quality=zero + 1)
+    assert saturated.groups == clear.groups
+    np.testing.assert_allclose(saturated.posterior, clear.posterior)
+
+
+def test_the_only_marker_of_its_size_is_no_pair_of_strangers_if_both_images_agree() -> None:
+    pairs, strangers = 10, 12
+    alone_of_its_kind = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        kind = np.zeros((2 * pairs, 2))
+        kind[:2] = np.log(2.0)
+        of_ray = np.concatenate([kind + rng.normal(0, 0.02, kind.shape), rng.normal(0.3, 0.7, (strangers, 2))])
+        n = len(of_ray)
+        a, b = np.append(np.arange(0, 2 * pairs, 2), n - 2), np.append(np.arange(1, 2 * pairs, 2), n - 1)
+        looks = Looks(np.arange(n), of_ray, np.zeros(n, int), a, b, np.zeros(len(a)), np.zeros(len(a)))
+        paired = (np.arange(n) < 2 * pairs).astype(float)
+        odds = log_odds_of_looks(looks, np.append(np.ones(pairs), 1e-6), images_alone(looks, paired), images_alone(looks.sizes, paired))
+        assert (odds[1:pairs] > 2).all()
+        assert odds[-1] < -1
+        alone_of_its_kind.append(odds[0])
+    assert np.mean(alone_of_its_kind) > -2
+
+
+def test_size_still_speaks_for_a_pair_whose_contrasts_do_not_agree() -> None:
+    better = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        rays = rays_to(some_markers(9, rng), rng, shared=False, sd_mm=0.05)
+        odd = next(i for i, name in enumerate(rays.marker) if name == (2, 0))
+        rays.contrast[odd] *= 4
+        doubt = []
+        for factor in (1.0, 1.4):
+            rays.radius_mm[odd] *= factor
+            pairing = rays.pair()
+            right = [
+                p for g, p in zip(pairing.groups, pairing.posterior, strict=True) if odd in rays.bundle.image[list(g)] and rays.right(g)
+            ]
+            doubt.append(1 - right[0] if right else 1.0)
+        better += doubt[0] < 0.5 * doubt[1]
+    assert better >= 9
