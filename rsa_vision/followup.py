@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from rsa_vision.contests import cloud_of, error_factor, settle_pairs
 from rsa_vision.flags import MarkerFlag, flag_names, flag_value
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.geometry.rigid import LEAST_POINTS
@@ -20,14 +21,13 @@ from rsa_vision.identify.hidden import Sighting, find_with_rays, hidden_markers
 from rsa_vision.identify.poses import TOLERANCE_MM, Cloud, place, volume_mm3
 from rsa_vision.segments import Segment, Segments, segments_of
 from rsa_vision.settings import Limits
-from rsa_vision.sightlines import free_rays
-from rsa_vision.tables import SCHEMAS, Row, Rows, split_name
+from rsa_vision.sightlines import Sightlines, is_free
+from rsa_vision.tables import AXES, SCHEMAS, Row, Rows, name_of, split_name
 from rsa_vision.types import Float
 from rsa_vision.verdict import Finding, conclude
 
 UNRELATED: Final = 8  # markers of which not one is found again, nor nearly: another object, not one whose few markers moved
 MOST_EARLIER: Final = 6  # examinations that one is compared with: the first, and the last ones before it
-AXES: Final = ("x_mm", "y_mm", "z_mm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +53,7 @@ class _Exam:
     findings: list[Finding] = field(default_factory=list)
     hidden: list[_Hidden] = field(default_factory=list)
     note: str = ""  # what a reader should know though nothing is wrong
+    told: str = ""  # likewise, of its pairs
 
 
 def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) -> list[Rows]:
@@ -84,8 +85,10 @@ def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) 
         for index in indices:
             if exams[index]["exams"][0]["status"] == "failed":
                 continue
-            exam = _open(exams[index])
+            rows = exams[index] if known is None else settle_pairs(exams[index], known, limits)
+            exam = _open(rows)
             if known is not None:
+                exam.told = _settled(exams[index], rows)
                 _name_by_segments(exam, known, limits)
             used = _name_by_earlier(exam, earlier, used, limits)
             earlier.append(exam)
@@ -93,20 +96,16 @@ def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) 
     return result
 
 
-def cloud_of(markers: Sequence[Row]) -> Cloud:
-    """Return rows of ``markers.csv`` that have coordinates as points with their covariances (0 where there is none)."""
-    position = np.array([[row[axis] for axis in AXES] for row in markers], dtype=np.float64).reshape(-1, 3)
-    covariance = np.zeros((len(markers), 3, 3))
-    for i, row in enumerate(markers):
-        sd = np.array([row[f"sd_{axis}"] or 0.0 for axis in AXES])
-        xy, xz, yz = (row[f"cov_{pair}_mm2"] or 0.0 for pair in ("xy", "xz", "yz"))
-        covariance[i] = np.diag(sd**2) + np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
-    return Cloud(position, covariance)
-
-
 def _open(rows: Rows) -> _Exam:
     located = [row for row in rows["markers"] if row["x_mm"] is not None]
     return _Exam(rows, located, cloud_of(located), [""] * len(located), [0] * len(located))
+
+
+def _settled(before: Rows, after: Rows) -> str:
+    doubts = "pair-ambiguous" in before["exams"][0]["reasons"].split(";")
+    if not doubts or "pair-ambiguous" in after["exams"][0]["reasons"].split(";"):
+        return ""
+    return "the known segments decide the doubtful pairs"
 
 
 def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) -> None:
@@ -133,14 +132,14 @@ def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) 
         agreed = [exam.names[a] for a in doubted if exam.names[a] and not exam.flags[a]]
         if agreed:
             exam.findings.append(("pair-ambiguous", f"the doubtful pairs of {', '.join(agreed)} agree with the constellation"))
-    extra = [_name(row) for row, name in zip(exam.located, exam.names, strict=True) if not name]
+    extra = [name_of(row) for row, name in zip(exam.located, exam.names, strict=True) if not name]
     if extra:
         exam.findings.append(("marker-mismatch", f"{len(extra)} markers belong to no known segment"))
 
 
 def _sightings(exam: _Exam, bodies: Sequence[Cloud], matched: Sequence[Known], limits: Limits) -> list[Sighting]:
     """Look for the markers that are missing among single images; what two segments claim goes to neither."""
-    rays = free_rays(exam.rows)
+    rays = _free_rays(exam.rows)
     nothing = Sighting((), (), None, decisive=True)
     if not len(rays):
         return [nothing] * len(bodies)
@@ -168,6 +167,14 @@ def _sightings(exam: _Exam, bodies: Sequence[Cloud], matched: Sequence[Known], l
         else replace(one, sights=tuple((i, int(r)) for i, r in one.sights), rays=rays)
         for one in found
     ]
+
+
+def _free_rays(rows: Rows) -> RayBundle:
+    """Return the rays of images that show no marker so far; where crossings are larger than stated, so are their errors."""
+    rays = Sightlines.read(rows).rays
+    free = np.array([is_free(rows["images"][i]) for i in rays.image.tolist()], bool)
+    factor = error_factor(rows["markers"])
+    return replace(rays.rows(free), covariance_mm2=factor**2 * rays.covariance_mm2[free])
 
 
 def _hidden(segment: Segment, sighting: Sighting, exam: _Exam) -> list[_Hidden]:
@@ -262,17 +269,17 @@ def _earlier_findings(exam: _Exam, new: Sequence[int], doubtful: Sequence[int], 
 
 def _renamed(exam: _Exam) -> Rows:
     """Return the rows with the names that were found; markers without coordinates keep theirs unless it is given away."""
-    names = {_name(row): name for row, name in zip(exam.located, exam.names, strict=True)}
+    names = {name_of(row): name for row, name in zip(exam.located, exam.names, strict=True)}
     taken = set(exam.names)
     for row in exam.rows["markers"]:
         if row["x_mm"] is None:
-            names[_name(row)] = _free(_name(row), taken)
-            taken.add(names[_name(row)])
-    flags = dict(zip(map(_name, exam.located), exam.flags, strict=True))
+            names[name_of(row)] = _free(name_of(row), taken)
+            taken.add(names[name_of(row)])
+    flags = dict(zip(map(name_of, exam.located), exam.flags, strict=True))
     markers = []
     for row in exam.rows["markers"]:
-        segment, marker = split_name(names[_name(row)])
-        markers.append({**row, "segment": segment, "marker": marker, "flags": _with_flags(row, flags.get(_name(row), 0))})
+        segment, marker = split_name(names[name_of(row)])
+        markers.append({**row, "segment": segment, "marker": marker, "flags": _with_flags(row, flags.get(name_of(row), 0))})
     images = [
         {**row, "number": names.get(row["number"], row["number"]), "flags": _with_flags(row, flags.get(row["number"], 0))}
         if row["role"] == "object"
@@ -284,7 +291,7 @@ def _renamed(exam: _Exam) -> Rows:
         for index, (focus, ray) in hidden.images.items():
             images[index] = _seen(images[index], hidden, focus, ray)
     row = _judged(exam.rows["exams"][0], exam.findings)
-    row["message"] = " | ".join(filter(None, [row["message"], exam.note]))
+    row["message"] = " | ".join(filter(None, [row["message"], exam.told, exam.note]))
     return {**exam.rows, "exams": [row], "images": images, "markers": markers}
 
 
@@ -323,7 +330,3 @@ def _judged(row: Row, findings: Sequence[Finding]) -> Row:
     verdict = conclude([*((code, row["message"]) for code in filter(None, row["reasons"].split(";"))), *findings])
     messages = [*filter(None, [row["message"]]), *(message for _, message in findings if message not in (row["message"] or ""))]
     return {**row, "status": verdict.status, "reasons": ";".join(verdict.reasons), "message": " | ".join(dict.fromkeys(messages))}
-
-
-def _name(row: Row) -> str:
-    return f"{row['segment']}/{row['marker']}" if row["segment"] else str(row["marker"])
