@@ -120,6 +120,8 @@ def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) 
             exam.names[a] = f"{segment.name}/{segment.markers[i]}"
         for _, a in known.loose:
             exam.flags[a] |= MarkerFlag.LOOSE
+        if sighting.pairs:  # with single rays they are sure
+            known = replace(known, doubtful=())
         for _, a in known.doubtful:
             exam.flags[a] |= MarkerFlag.AMBIGUOUS
         seen = {i for i, _ in (*sighting.pairs, *sighting.sights)}
@@ -152,11 +154,12 @@ def _sightings(exam: _Exam, bodies: Sequence[Cloud], matched: Sequence[Known], l
             seen = known.pairs if not known.loose else tuple(pair for pair in known.pairs if pair not in known.loose)
             missing = set(known.lost)
             sighting = hidden_markers(body, exam.cloud, seen, known.placement, rays, missing, volume, limits.posterior)
-        elif not known.doubtful:
-            sighting = find_with_rays(body, exam.cloud.rows(free), rays, volume, limits.posterior)
-            sighting = replace(sighting, pairs=tuple((i, int(free[a])) for i, a in sighting.pairs))
         else:
-            sighting = nothing
+            mine = np.union1d(free, np.array([a for _, a in known.doubtful], np.int64)).astype(np.int64)
+            sighting = find_with_rays(body, exam.cloud.rows(mine), rays, volume, limits.posterior, exam.cloud.position_mm)
+            sighting = replace(sighting, pairs=tuple((i, int(mine[a])) for i, a in sighting.pairs))
+            if known.doubtful and not sighting.decisive:
+                sighting = nothing  # the doubt about the points says it all
         found.append(sighting if sighting.decisive else replace(nothing, decisive=False))
     claims = [claim for one in found for claim in {("image", rays.image[r]) for _, r in one.sights} | {("point", a) for _, a in one.pairs}]
     return [

@@ -31,12 +31,16 @@ from rsa_vision.identify.poses import (
     rotation_by,
 )
 from rsa_vision.identify.ray_poses import off_rays, place_with_rays
+from rsa_vision.identify.ray_triples import depth_range, poses_by_rays
 from rsa_vision.types import Bool, Float
 
 TURNS: Final = 90  # poses tried around the line through two known places
 COARSE_MM: Final = 3.0  # how near a ray must come to be tried then
 GRAZING_MM: Final = 0.5  # by which a ray may miss the sphere on which its marker lies
 MOST_TRIED: Final = 150
+LEAST_ALONE: Final = 4  # markers that rays alone must meet: three fit any three rays
+MARGIN_MM: Final = 100.0  # by which a body may lie deeper or higher than the other markers
+DEPTHS: Final = np.array([0.3, 1.02])  # without any: parts of the way from the focus to the plane
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,8 +128,10 @@ def hidden_markers(
     return Sighting(pairs, sights, together or placement, bool(together) and not (packing.chosen & ~sure).any())
 
 
-def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, posterior: float) -> Sighting:
-    """Find a segment with fewer than three markers seen from several foci: by these and by rays that belong to nothing.
+def find_with_rays(
+    body: Cloud, points: Cloud, rays: RayBundle, volume: float, posterior: float, around_mm: Float | None = None
+) -> Sighting:
+    """Find a segment whose points alone do not tell its pose, with rays that belong to nothing, or by these alone.
 
     Parameters
     ----------
@@ -134,6 +140,8 @@ def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, p
     rays : RayBundle
     volume : float
     posterior : float
+    around_mm : ndarray of shape (k, 3), optional
+        Places of other markers: how deep along the rays to look. Default: anywhere from the film to near the foci.
 
     Returns
     -------
@@ -144,10 +152,11 @@ def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, p
     -----
     Two places begin a hypothesis: points of two markers with their distance, or a point and where a ray pierces the sphere about it on
     which another marker must lie. The body is turned about the line through both, and where a third marker meets a ray its pose is fitted
-    and grown.
+    and grown. So is every pose at which three markers lie on three rays (:mod:`ray_triples`) and a fourth one near another. Beside each
+    assignment stand those in which a marker has another ray near it.
     """
     scene = _Scene(body, points, rays, volume, STRAY + len(points))
-    starts = sorted(_starts(scene), key=lambda start: -start.met)
+    starts = sorted([*_starts(scene), *_by_rays_alone(scene, around_mm)], key=lambda start: (-start.met, start.off_mm))
     found: dict[tuple[Pairs, Pairs], list[Placement]] = {}
     for start in starts[:MOST_TRIED]:
         if (grown := _grown(scene, start)) is not None:
@@ -157,6 +166,10 @@ def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, p
                 np.linalg.norm(placement.predict(body.position_mm)[0] - p.predict(body.position_mm)[0], axis=1).max() > 1.0 for p in same
             ):
                 same.append(placement)
+    for key, placements in [*found.items()]:
+        for other in _exchanged(scene, key, placements[0]):
+            if other not in found and (fit := _fitted(scene, *other, placements[0])):
+                found[other] = [fit]
     every = [(_log_odds(scene, *key, placement), key, placement) for key, placements in found.items() for placement in placements]
     every = sorted((one for one in every if one[0] > NEGLIGIBLE), key=lambda one: (-one[0], one[1]))
     if not every:
@@ -183,6 +196,7 @@ class _Start:
     pairs: Pairs
     sights: Pairs
     met: int
+    off_mm: float = 0.0  # sum of how far its markers pass rays, as far as they do
 
 
 def _starts(scene: _Scene) -> Iterator[_Start]:
@@ -200,6 +214,49 @@ def _starts(scene: _Scene) -> Iterator[_Start]:
                 ends += [(end, ((i, a),), ((j, r),)) for end in _pierced(scene, base, float(length[i, j]), r)]
             for end, pairs, sights in ends:
                 yield from _turned(scene, (i, j), (base, end), pairs, sights)
+
+
+def _by_rays_alone(scene: _Scene, around_mm: Float | None) -> list[_Start]:
+    """Return poses at which three markers lie on rays and a fourth one comes near another: of poses nearly alike the best."""
+    body, rays = scene.body.position_mm, scene.rays
+    if len(body) < LEAST_ALONE or len(rays) < LEAST_ALONE:
+        return []
+    size = float(distances(scene.body)[0].max())
+    if around_mm is None or not len(around_mm):
+        depth = np.linalg.norm(rays.through_mm - rays.origin_mm, axis=1)[:, None] * DEPTHS
+    else:
+        depth = depth_range(rays, around_mm, MARGIN_MM + size)
+    best: dict[bytes, _Start] = {}
+    for poses in poses_by_rays(body, rays, depth) or ():
+        moved = np.einsum("pij,nj->pni", poses.rotation, body) + poses.translation[:, None]
+        offset = moved[:, :, None] - rays.through_mm
+        off = np.sqrt(np.maximum((offset**2).sum(-1) - np.einsum("pnrj,rj->pnr", offset, rays.direction) ** 2, 0.0)).min(axis=2)
+        away = np.linalg.norm(moved[:, :, None] - scene.points.position_mm, axis=-1).min(axis=2, initial=np.inf)
+        off = np.minimum(np.minimum(off, away), COARSE_MM)
+        met, total = (off < COARSE_MM).sum(axis=1), off.sum(axis=1)
+        alike = np.concatenate([np.round(4 * poses.rotation.reshape(-1, 9)), np.round(poses.translation / 10)], axis=1).astype(np.int16)
+        for p in np.flatnonzero(met >= LEAST_ALONE).tolist():
+            key = alike[p].tobytes()
+            if key not in best or (met[p], -total[p]) > (best[key].met, -best[key].off_mm):
+                sights = tuple(sorted(zip(poses.markers[p].tolist(), poses.rays[p].tolist(), strict=True)))
+                best[key] = _Start(poses.rotation[p], poses.translation[p], (), sights, int(met[p]), float(total[p]))
+    return list(best.values())
+
+
+def _exchanged(scene: _Scene, key: tuple[Pairs, Pairs], placement: Placement) -> Iterator[tuple[Pairs, Pairs]]:
+    """Yield assignments in which a marker has another ray of the same focus that passes it as well."""
+    pairs, sights = key
+    off, _ = off_rays(scene.body, scene.rays, placement)
+    used = {r for _, r in sights}
+    for marker, ray in sights:
+        rest = tuple(sight for sight in sights if sight != (marker, ray))
+        for other in np.flatnonzero((off[marker] < GATE) & (scene.rays.focus == scene.rays.focus[ray])).tolist():
+            if other not in used:
+                yield pairs, tuple(sorted([*rest, (marker, other)]))
+
+
+def _fitted(scene: _Scene, pairs: Pairs, sights: Pairs, near: Placement) -> Placement | None:
+    return place_with_rays(scene.body, scene.points, pairs, scene.rays, sights, near.rotation, near.translation)
 
 
 def _pierced(scene: _Scene, base: Float, radius: float, r: int) -> list[Float]:
