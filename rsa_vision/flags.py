@@ -26,6 +26,7 @@ class MarkerFlag(IntFlag):
     NO_COVARIANCE = 1024  # the input gave no covariance
     FOREIGN_MARK = 2048  # a cage mark that this focus is not meant to see; explained, not used
     LOOSE = 4096  # not where the other markers of its rigid body say
+    MISSING = 8192  # a marker that the subject has, of which nothing was found here
 
 
 def flag_names(value: int) -> str:

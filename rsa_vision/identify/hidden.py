@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from rsa_vision.geometry.rays import RayBundle
+from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.constellation import FOUND, NEGLIGIBLE, STRAY
 from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import (
@@ -38,6 +39,7 @@ TURNS: Final = 90  # poses tried around the line through two known places
 COARSE_MM: Final = 3.0  # how near a ray must come to be tried then
 GRAZING_MM: Final = 0.5  # by which a ray may miss the sphere on which its marker lies
 MOST_TRIED: Final = 150
+SAME_MM: Final = 1.0  # by which the markers of one pose may differ
 LEAST_ALONE: Final = 4  # markers that rays alone must meet: three fit any three rays
 MARGIN_MM: Final = 100.0  # by which a body may lie deeper or higher than the other markers
 DEPTHS: Final = np.array([0.3, 1.02])  # without any: parts of the way from the focus to the plane
@@ -129,7 +131,14 @@ def hidden_markers(
 
 
 def find_with_rays(
-    body: Cloud, points: Cloud, rays: RayBundle, volume: float, posterior: float, around_mm: Float | None = None
+    body: Cloud,
+    points: Cloud,
+    rays: RayBundle,
+    volume: float,
+    posterior: float,
+    *,
+    around_mm: Float | None = None,
+    present: float = 0.5,
 ) -> Sighting:
     """Find a segment whose points alone do not tell its pose, with rays that belong to nothing, or by these alone.
 
@@ -142,6 +151,8 @@ def find_with_rays(
     posterior : float
     around_mm : ndarray of shape (k, 3), optional
         Places of other markers: how deep along the rays to look. Default: anywhere from the film to near the foci.
+    present : float
+        Probability that the segment is on the films at all, before they are looked at.
 
     Returns
     -------
@@ -158,27 +169,50 @@ def find_with_rays(
     scene = _Scene(body, points, rays, volume, STRAY + len(points))
     starts = sorted([*_starts(scene), *_by_rays_alone(scene, around_mm)], key=lambda start: (-start.met, start.off_mm))
     found: dict[tuple[Pairs, Pairs], list[Placement]] = {}
+
+    def add(pairs: Pairs, sights: Pairs, placement: Placement) -> None:
+        same = found.setdefault((pairs, sights), [])
+        if not any(_alike(body, placement, other) for other in same):
+            same.append(placement)
+
     for start in starts[:MOST_TRIED]:
         if (grown := _grown(scene, start)) is not None:
-            kept, seen, placement = grown
-            same = found.setdefault((kept, seen), [])
-            if all(
-                np.linalg.norm(placement.predict(body.position_mm)[0] - p.predict(body.position_mm)[0], axis=1).max() > 1.0 for p in same
-            ):
-                same.append(placement)
-    for key, placements in [*found.items()]:
-        for other in _exchanged(scene, key, placements[0]):
-            if other not in found and (fit := _fitted(scene, *other, placements[0])):
-                found[other] = [fit]
+            add(*grown)
+    grown_ones = [(_log_odds(scene, *key, one), key, one) for key, placements in found.items() for one in placements]
+    best = max((odds for odds, _, _ in grown_ones), default=0.0)
+    for _, key, placement in (one for one in grown_ones if one[0] > best + NEGLIGIBLE):
+        for other in _neighbours(scene, *key, placement):
+            if fit := _fitted(scene, *other, placement):
+                add(*other, fit)
     every = [(_log_odds(scene, *key, placement), key, placement) for key, placements in found.items() for placement in placements]
     every = sorted((one for one in every if one[0] > NEGLIGIBLE), key=lambda one: (-one[0], one[1]))
     if not every:
         return Sighting((), (), None, False)
-    odds, (pairs, sights), placement = every[0]
-    total = float(logsumexp([0.0, *(one[0] for one in every)]))
+    total = float(logsumexp([np.log(1 / present - 1), *(one[0] for one in every)]))
+    _, (pairs, sights), placement = every[0]
+    same = [(odds, {*key[0]}, {*key[1]}) for odds, key, other in every if _alike(body, placement, other)]
+
+    def chance(some_pairs: Pairs, some_sights: Pairs) -> float:
+        holding = [odds for odds, one, two in same if one.issuperset(some_pairs) and two.issuperset(some_sights)]
+        return float(np.exp(logsumexp(holding) - total)) if holding else 0.0
+
+    pairs = tuple(pair for pair in pairs if chance((pair,), ()) >= posterior)
+    sights = tuple(sight for sight in sights if chance((), (sight,)) >= posterior)
+    markers = {i for i, _ in (*pairs, *sights)}
     untried = starts[MOST_TRIED].met if len(starts) > MOST_TRIED else 0  # as many markers might be met there
-    decisive = np.exp(odds - total) >= posterior and untried < len({i for i, _ in (*pairs, *sights)})
-    return Sighting(pairs, sights, placement, bool(decisive))
+    decisive = len(markers) >= LEAST_POINTS and chance(pairs, sights) >= posterior and untried < len(markers)
+    if decisive and (pairs, sights) != every[0][1]:
+        fitted = _fitted(scene, pairs, sights, placement)
+        decisive, placement = fitted is not None, fitted or placement
+    return Sighting(pairs, sights, placement, decisive)
+
+
+def _alike(body: Cloud, one: Placement, other: Placement) -> bool:
+    """Tell whether two poses are the same within their errors, or nearly."""
+    (mine, by_mine), (theirs, by_theirs) = one.predict(body.position_mm), other.predict(body.position_mm)
+    away = mine - theirs
+    squares = np.einsum("ni,nij,nj->n", away, np.linalg.inv(by_mine + by_theirs + TOLERANCE_MM**2 * np.eye(3)), away)
+    return bool((np.linalg.norm(away, axis=1) < SAME_MM).all() or (squares < GATE**2).all())
 
 
 def _log_odds(scene: _Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> float:
@@ -243,19 +277,27 @@ def _by_rays_alone(scene: _Scene, around_mm: Float | None) -> list[_Start]:
     return list(best.values())
 
 
-def _exchanged(scene: _Scene, key: tuple[Pairs, Pairs], placement: Placement) -> Iterator[tuple[Pairs, Pairs]]:
-    """Yield assignments in which a marker has another ray of the same focus that passes it as well."""
-    pairs, sights = key
+def _neighbours(scene: _Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> Iterator[tuple[Pairs, Pairs]]:
+    """Yield assignments in which one marker is left out, or has another point or ray of the same focus that it meets as well."""
+    away = nearness(scene.body, scene.points, placement) if len(scene.points) else np.zeros((len(scene.body), 0))
     off, _ = off_rays(scene.body, scene.rays, placement)
-    used = {r for _, r in sights}
-    for marker, ray in sights:
-        rest = tuple(sight for sight in sights if sight != (marker, ray))
-        for other in np.flatnonzero((off[marker] < GATE) & (scene.rays.focus == scene.rays.focus[ray])).tolist():
-            if other not in used:
-                yield pairs, tuple(sorted([*rest, (marker, other)]))
+    for pair in pairs:
+        rest = tuple(other for other in pairs if other != pair)
+        yield rest, sights
+        for a in np.flatnonzero(away[pair[0]] < GATE).tolist():
+            if a not in {b for _, b in pairs}:
+                yield tuple(sorted([*rest, (pair[0], a)])), sights
+    for sight in sights:
+        rest = tuple(other for other in sights if other != sight)
+        yield pairs, rest
+        for r in np.flatnonzero((off[sight[0]] < GATE) & (scene.rays.focus == scene.rays.focus[sight[1]])).tolist():
+            if r not in {x for _, x in sights}:
+                yield pairs, tuple(sorted([*rest, (sight[0], r)]))
 
 
 def _fitted(scene: _Scene, pairs: Pairs, sights: Pairs, near: Placement) -> Placement | None:
+    if len({i for i, _ in (*pairs, *sights)}) < LEAST_POINTS:
+        return None
     return place_with_rays(scene.body, scene.points, pairs, scene.rays, sights, near.rotation, near.translation)
 
 

@@ -81,7 +81,7 @@ def hide(films: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def places(table: pl.DataFrame, exam: str) -> dict[str, np.ndarray]:
-    rows = table.filter(pl.col("exam") == exam).to_dicts()
+    rows = table.filter((pl.col("exam") == exam) & pl.col("x_mm").is_not_null()).to_dicts()
     return {f"{r['segment'] or ''}/{r['marker']}".lstrip("/"): np.array([r["x_mm"], r["y_mm"], r["z_mm"]]) for r in rows}
 
 
@@ -139,6 +139,9 @@ def test_names_without_segments_stay_those_of_the_first_examination(films: Path,
     for given in names.values():
         assert all(meaning[name] == true for name, true in given.items())
     assert len(names[THIRD]) == 11
+    (lost,) = read(tmp_path / "markers.csv").filter(pl.col("x_mm").is_null()).to_dicts()  # what nothing shows has a row that says so
+    (implant_1,) = (name for name, true in names[FIRST].items() if true == "implant/1")
+    assert (lost["exam"], lost["marker"], lost["flags"], lost["n_views"]) == (SECOND, implant_1, "missing", 0)
     assert exams(tmp_path)[FIRST] == ("ok", "")
     assert exams(tmp_path)[SECOND][0] == "review"  # a marker that the first did not show
     assert exams(tmp_path)[THIRD] == ("ok", "")  # by now it is known
@@ -199,8 +202,12 @@ def test_names_given_twice_are_the_same_and_too_few_markers_are_never_named() ->
         assert first["exams"][0]["status"] == last["exams"][0]["status"] == "ok"
         assert [row["marker"] for row in last["markers"]] == [row["marker"] for row in first["markers"]][::-1]
         assert few["exams"][0]["status"] == "review"
-        assert not {row["marker"] for row in few["markers"]} & {row["marker"] for row in first["markers"]}
-        assert none["markers"] == []
+        every = {row["marker"] for row in first["markers"]}
+        assert not {row["marker"] for row in few["markers"] if row["x_mm"] is not None} & every
+        for exam in (few, none):
+            missing = [row for row in exam["markers"] if row["x_mm"] is None]
+            assert {row["marker"] for row in missing} == every
+            assert all(row["flags"] == "missing" and row["n_views"] == 0 for row in missing)
 
 
 def test_doubtful_pairs_that_agree_with_the_segment_stay_in_review_and_it_says_so() -> None:
