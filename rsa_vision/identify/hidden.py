@@ -196,8 +196,11 @@ def find_with_rays(
         holding = [odds for odds, one, two in same if one.issuperset(some_pairs) and two.issuperset(some_sights)]
         return float(np.exp(logsumexp(holding) - total)) if holding else 0.0
 
-    pairs = tuple(pair for pair in pairs if chance((pair,), ()) >= posterior)
-    sights = tuple(sight for sight in sights if chance((), (sight,)) >= posterior)
+    doubts = sorted([(chance((pair,), ()), pair, 0) for pair in pairs] + [(chance((), (sight,)), sight, 1) for sight in sights])
+    while doubts and chance(pairs, sights) < posterior:  # the least sure have no name
+        _, doubted, kind = doubts.pop(0)
+        pairs = tuple(pair for pair in pairs if kind or pair != doubted)
+        sights = tuple(sight for sight in sights if not kind or sight != doubted)
     markers = {i for i, _ in (*pairs, *sights)}
     untried = starts[MOST_TRIED].met if len(starts) > MOST_TRIED else 0  # as many markers might be met there
     decisive = len(markers) >= LEAST_POINTS and chance(pairs, sights) >= posterior and untried < len(markers)
