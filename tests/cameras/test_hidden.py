@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from rsa_vision.cameras import Camera
 from rsa_vision.examination import name_and_reconstruct
 from rsa_vision.followup import follow_up
+from rsa_vision.identify.poses import TOLERANCE_MM
 from rsa_vision.readings import FilmReading
 from rsa_vision.segments import Segment
 from rsa_vision.settings import Limits, Study
 from rsa_vision.tables import examination_rows
 from rsa_vision.types import Float, MarkerImages
-from rsa_vision.identify.poses import TOLERANCE_MM
 from tests.identify.bodies import random_body
 
 SIZE, FOCAL_PX, DISTANCE_MM, SD_PX = 1000, 5000.0, 900.0, 0.05
@@ -53,7 +53,7 @@ def two_bodies(rng: np.random.Generator) -> tuple[Float, list[Segment]]:
     places, segments = [], []
     for index, n in enumerate((7, 6)):
         body = random_body(rng, n, 12.0)
-        at = Rotation.random(random_state=rng).apply(body) + [0, 50 * index - 25, 0]
+        at = Rotation.random(random_state=rng).apply(body) + np.array([0, 50 * index - 25, 0])
         places.append(at + rng.normal(0, TOLERANCE_MM, at.shape))
         segments.append(Segment(f"s{index}", tuple(map(str, range(n))), body))
     return np.concatenate(places), segments
