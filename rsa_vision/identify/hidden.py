@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from itertools import permutations
 from typing import Final
 
 import numpy as np
@@ -18,31 +17,22 @@ from scipy.special import logsumexp
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.constellation import FOUND, NEGLIGIBLE, STRAY
+from rsa_vision.identify.hidden_starts import Scene, Start, first_poses
 from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import (
     GATE,
-    GATE_SCALE,
     SCALES,
     TOLERANCE_MM,
     Cloud,
     Pairs,
     Placement,
-    distances,
     nearness,
-    rotation_by,
 )
 from rsa_vision.identify.ray_poses import off_rays, place_with_rays
-from rsa_vision.identify.ray_triples import depth_range, poses_by_rays
 from rsa_vision.types import Bool, Float
 
-TURNS: Final = 90  # poses tried around the line through two known places
-COARSE_MM: Final = 3.0  # how near a ray must come to be tried then
-GRAZING_MM: Final = 0.5  # by which a ray may miss the sphere on which its marker lies
 MOST_TRIED: Final = 150
 SAME_MM: Final = 1.0  # by which the markers of one pose may differ
-LEAST_ALONE: Final = 4  # markers that rays alone must meet: three fit any three rays
-MARGIN_MM: Final = 100.0  # by which a body may lie deeper or higher than the other markers
-DEPTHS: Final = np.array([0.3, 1.02])  # without any: parts of the way from the focus to the plane
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,21 +56,6 @@ class Sighting:
     placement: Placement | None
     decisive: bool
     rays: RayBundle | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    body: Cloud
-    points: Cloud
-    rays: RayBundle
-    volume: float
-    stray: float
-
-    @property
-    def worth(self) -> tuple[float, float]:
-        """Log worth of a point (3-D) and of a ray (2-D) that need not be explained otherwise."""
-        area = self.volume ** (2 / 3)
-        return float(np.log(self.volume / self.stray)), float(np.log(area / (STRAY + len(self.rays))))
 
 
 def hidden_markers(
@@ -114,7 +89,7 @@ def hidden_markers(
     Sighting
         ``decisive`` is False where a ray may be of a missing marker, but not decisively.
     """
-    scene = _Scene(body, points, rays, volume, STRAY)
+    scene = Scene(body, points, rays, volume, STRAY)
     away, log_density = off_rays(body, rays, placement)
     marker, ray = np.nonzero(away < GATE)
     tried = [(int(i), int(r)) for i, r in zip(marker, ray, strict=True) if i in missing]
@@ -166,8 +141,8 @@ def find_with_rays(
     and grown. So is every pose at which three markers lie on three rays (:mod:`ray_triples`) and a fourth one near another. Beside each
     assignment stand those in which a marker has another ray near it.
     """
-    scene = _Scene(body, points, rays, volume, STRAY + len(points))
-    starts = sorted([*_starts(scene), *_by_rays_alone(scene, around_mm)], key=lambda start: (-start.met, start.off_mm))
+    scene = Scene(body, points, rays, volume, STRAY + len(points))
+    starts = first_poses(scene, around_mm)
     found: dict[tuple[Pairs, Pairs], list[Placement]] = {}
 
     def add(pairs: Pairs, sights: Pairs, placement: Placement) -> None:
@@ -218,69 +193,13 @@ def _alike(body: Cloud, one: Placement, other: Placement) -> bool:
     return bool((np.linalg.norm(away, axis=1) < SAME_MM).all() or (squares < GATE**2).all())
 
 
-def _log_odds(scene: _Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> float:
+def _log_odds(scene: Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> float:
     n, found = len(scene.body), len({i for i, _ in (*pairs, *sights)})
     worth = len(pairs) * scene.worth[0] + len(sights) * scene.worth[1] - float(np.log(8 * np.pi**2 * scene.volume))
     return placement.log_likelihood + worth + found * float(np.log(FOUND)) + (n - found) * float(np.log(1 - FOUND))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Start:
-    """A first pose, what it rests on, and how many markers it brings near a point or a ray."""
-
-    rotation: Float
-    translation: Float
-    pairs: Pairs
-    sights: Pairs
-    met: int
-    off_mm: float = 0.0  # sum of how far its markers pass rays, as far as they do
-
-
-def _starts(scene: _Scene) -> Iterator[_Start]:
-    body, places = scene.body, scene.points.position_mm
-    length = distances(body)[0]
-    for i, j in permutations(range(len(body)), 2):
-        for a, base in enumerate(places):
-            ends: list[tuple[Float, Pairs, Pairs]] = []
-            for b, end in enumerate(places if i < j else ()):
-                spread = scene.points.covariance_mm2[a] + scene.points.covariance_mm2[b]
-                sd = np.sqrt(GATE_SCALE**2 * np.linalg.eigvalsh(spread)[-1] + 2 * TOLERANCE_MM**2)
-                if a != b and abs(float(np.linalg.norm(end - base)) - length[i, j]) < GATE * sd:
-                    ends.append((end, ((i, a), (j, b)), ()))
-            for r in range(len(scene.rays)):
-                ends += [(end, ((i, a),), ((j, r),)) for end in _pierced(scene, base, float(length[i, j]), r)]
-            for end, pairs, sights in ends:
-                yield from _turned(scene, (i, j), (base, end), pairs, sights)
-
-
-def _by_rays_alone(scene: _Scene, around_mm: Float | None) -> list[_Start]:
-    """Return poses at which three markers lie on rays and a fourth one comes near another: of poses nearly alike the best."""
-    body, rays = scene.body.position_mm, scene.rays
-    if len(body) < LEAST_ALONE or len(rays) < LEAST_ALONE:
-        return []
-    size = float(distances(scene.body)[0].max())
-    if around_mm is None or not len(around_mm):
-        depth = np.linalg.norm(rays.through_mm - rays.origin_mm, axis=1)[:, None] * DEPTHS
-    else:
-        depth = depth_range(rays, around_mm, MARGIN_MM + size)
-    best: dict[bytes, _Start] = {}
-    for poses in poses_by_rays(body, rays, depth) or ():
-        moved = np.einsum("pij,nj->pni", poses.rotation, body) + poses.translation[:, None]
-        offset = moved[:, :, None] - rays.through_mm
-        off = np.sqrt(np.maximum((offset**2).sum(-1) - np.einsum("pnrj,rj->pnr", offset, rays.direction) ** 2, 0.0)).min(axis=2)
-        away = np.linalg.norm(moved[:, :, None] - scene.points.position_mm, axis=-1).min(axis=2, initial=np.inf)
-        off = np.minimum(np.minimum(off, away), COARSE_MM)
-        met, total = (off < COARSE_MM).sum(axis=1), off.sum(axis=1)
-        alike = np.concatenate([np.round(4 * poses.rotation.reshape(-1, 9)), np.round(poses.translation / 10)], axis=1).astype(np.int16)
-        for p in np.flatnonzero(met >= LEAST_ALONE).tolist():
-            key = alike[p].tobytes()
-            if key not in best or (met[p], -total[p]) > (best[key].met, -best[key].off_mm):
-                sights = tuple(sorted(zip(poses.markers[p].tolist(), poses.rays[p].tolist(), strict=True)))
-                best[key] = _Start(poses.rotation[p], poses.translation[p], (), sights, int(met[p]), float(total[p]))
-    return list(best.values())
-
-
-def _neighbours(scene: _Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> Iterator[tuple[Pairs, Pairs]]:
+def _neighbours(scene: Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> Iterator[tuple[Pairs, Pairs]]:
     """Yield assignments in which one marker is left out, or has another point or ray of the same focus that it meets as well."""
     away = nearness(scene.body, scene.points, placement) if len(scene.points) else np.zeros((len(scene.body), 0))
     off, _ = off_rays(scene.body, scene.rays, placement)
@@ -298,53 +217,13 @@ def _neighbours(scene: _Scene, pairs: Pairs, sights: Pairs, placement: Placement
                 yield pairs, tuple(sorted([*rest, (sight[0], r)]))
 
 
-def _fitted(scene: _Scene, pairs: Pairs, sights: Pairs, near: Placement) -> Placement | None:
+def _fitted(scene: Scene, pairs: Pairs, sights: Pairs, near: Placement) -> Placement | None:
     if len({i for i, _ in (*pairs, *sights)}) < LEAST_POINTS:
         return None
     return place_with_rays(scene.body, scene.points, pairs, scene.rays, sights, near.rotation, near.translation)
 
 
-def _pierced(scene: _Scene, base: Float, radius: float, r: int) -> list[Float]:
-    """Return where a ray meets a sphere, or comes next to it if it just misses."""
-    through, direction = scene.rays.through_mm[r], scene.rays.direction[r]
-    along = float((base - through) @ direction)
-    foot = through + along * direction
-    square = radius**2 - float(((foot - base) ** 2).sum())
-    if square < -2 * radius * GRAZING_MM:
-        return []
-    half = float(np.sqrt(max(square, 0.0)))
-    return [foot + half * direction, foot - half * direction] if half > 0 else [foot]
-
-
-def _turned(scene: _Scene, ends: tuple[int, int], places: tuple[Float, Float], pairs: Pairs, sights: Pairs) -> Iterator[_Start]:
-    """Turn the body about the line through two places; yield the poses at which another marker passes a ray."""
-    (i, j), (base, end), body = ends, places, scene.body.position_mm
-    line = end - base
-    first, axis = _aligning(body[j] - body[i], line), line / np.linalg.norm(line)
-    turns = np.stack([rotation_by(axis * angle) @ first for angle in np.arange(TURNS) * 2 * np.pi / TURNS])
-    moved = np.einsum("tij,nj->tni", turns, body - body[i]) + base  # (t, n, 3)
-    off = np.linalg.norm(np.cross(moved[:, :, None] - scene.rays.through_mm, scene.rays.direction), axis=-1)  # (t, n, r)
-    away = np.linalg.norm(moved[:, :, None] - scene.points.position_mm, axis=-1)
-    met = ((off < COARSE_MM).any(axis=2) | (away < COARSE_MM).any(axis=2)).sum(axis=1)
-    least = (off < COARSE_MM) & (off <= np.roll(off, 1, axis=0)) & (off < np.roll(off, -1, axis=0))
-    for t, marker, ray in np.argwhere(least).tolist():
-        if marker not in ends and ray not in {r for _, r in sights}:
-            seen = tuple(sorted([*sights, (marker, ray)]))
-            yield _Start(turns[t], base - turns[t] @ body[i], pairs, seen, int(met[t]))
-
-
-def _aligning(source: Float, target: Float) -> Float:
-    """Return a rotation that turns one direction into another."""
-    a, b = source / np.linalg.norm(source), target / np.linalg.norm(target)
-    axis = np.cross(a, b)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-9:
-        other = np.cross(a, [1.0, 0, 0] if abs(a[0]) < 0.9 else [0, 1.0, 0])
-        return np.eye(3) if a @ b > 0 else rotation_by(np.pi * other / np.linalg.norm(other))
-    return rotation_by(axis / sine * np.arctan2(sine, a @ b))
-
-
-def _grown(scene: _Scene, start: _Start) -> tuple[Pairs, Pairs, Placement] | None:
+def _grown(scene: Scene, start: Start) -> tuple[Pairs, Pairs, Placement] | None:
     """Fit a first pose, and take in what it meets until nothing changes."""
     body, points, rays = scene.body, scene.points, scene.rays
     pairs, sights, rotation, translation = start.pairs, start.sights, start.rotation, start.translation
@@ -363,7 +242,7 @@ def _grown(scene: _Scene, start: _Start) -> tuple[Pairs, Pairs, Placement] | Non
     return (pairs, sights, placement) if placement is not None and (pairs, sights) == _met(scene, placement) else None
 
 
-def _met(scene: _Scene, placement: Placement) -> tuple[Pairs, Pairs]:
+def _met(scene: Scene, placement: Placement) -> tuple[Pairs, Pairs]:
     """Return the points and rays that markers meet at a pose: the nearest in units of sd first, points before rays."""
     pairs: dict[int, int] = {}
     sights: dict[tuple[int, int], int] = {}
