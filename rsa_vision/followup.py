@@ -21,7 +21,7 @@ from rsa_vision.identify.poses import Cloud, place
 from rsa_vision.ordering import natural_key
 from rsa_vision.segments import Segment, Segments, segments_of
 from rsa_vision.settings import Limits
-from rsa_vision.sighted import HiddenMarker, find_sightings, hidden_of, image_row, missing_row, predicted_row
+from rsa_vision.sighted import HiddenMarker, find_sightings, hidden_of, hidden_since, image_row, missing_row, predicted_row
 from rsa_vision.tables import Row, Rows, name_of, split_name
 from rsa_vision.verdict import Finding, conclude
 
@@ -107,7 +107,7 @@ def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) 
     bodies = [Cloud.exact(segment.position_mm) for segment in segments]
     matched = match_segments(bodies, exam.cloud, limits.posterior)
     sightings = find_sightings(exam.rows, exam.cloud, bodies, matched, limits)
-    for segment, known, sighting in zip(segments, matched, sightings, strict=True):
+    for segment, body, known, sighting in zip(segments, bodies, matched, sightings, strict=True):
         for i, a in (*known.pairs, *known.loose, *sighting.pairs):
             exam.names[a] = f"{segment.name}/{segment.markers[i]}"
         for _, a in known.loose:
@@ -121,7 +121,7 @@ def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) 
         exam.missing |= {f"{segment.name}/{segment.markers[i]}" for i in (*lost, *(i for i, _ in known.doubtful))}
         exam.findings += _segment_findings(segment, replace(known, lost=lost), sighting, limits)
         if sighting.placement is not None:
-            exam.hidden += hidden_of(segment, sighting)
+            exam.hidden += hidden_of([f"{segment.name}/{marker}" for marker in segment.markers], body, sighting)
     if "pair-ambiguous" in exam.rows["exams"][0]["reasons"].split(";"):
         doubted = [a for a, row in enumerate(exam.located) if flag_value(row["flags"] or "") & MarkerFlag.AMBIGUOUS]
         agreed = [exam.names[a] for a in doubted if exam.names[a] and not exam.flags[a]]
@@ -189,7 +189,24 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
         known = {name for other in earlier for name in other.names if not split_name(name)[0]}
         exam.missing |= known - set(exam.names) - {name for other in earlier for name in other.unsure}
         exam.findings += _earlier_findings(exam, [left[a] for a in new], [left[a] for a in new if doubtful[a]], known)
+        _name_hidden(exam, earlier[0], limits)
     return used
+
+
+def _name_hidden(exam: _Exam, first: _Exam, limits: Limits) -> None:
+    """Name single images that show markers of the first examination."""
+    free = [i for i, name in enumerate(first.names) if not split_name(name)[0]]
+    names = [first.names[i] for i in free]
+    found = tuple((names.index(name), a) for a, name in enumerate(exam.names) if name in names)
+    before = first.cloud.rows(np.array(free, dtype=np.int64))
+    used = {index for one in exam.hidden for index in one.images}
+    hidden = hidden_since(exam.rows, before, names, exam.cloud, tuple(sorted(found)), exam.missing, limits)
+    hidden = [one for one in hidden if not used & set(one.images)]
+    exam.hidden += hidden
+    exam.missing -= {one.name for one in hidden}
+    if hidden:
+        told = ", ".join(one.name for one in hidden)
+        exam.findings.append(("marker-one-view", f"{told} seen from one focus only, predicted by the first examination"))
 
 
 def _earlier_findings(exam: _Exam, new: Sequence[int], doubtful: Sequence[int], known: set[str]) -> list[Finding]:

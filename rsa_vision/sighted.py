@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -11,15 +11,15 @@ import numpy as np
 from rsa_vision.contests import error_factor
 from rsa_vision.flags import MarkerFlag, flag_names, flag_value
 from rsa_vision.geometry.rays import RayBundle
-from rsa_vision.identify.constellation import Known
+from rsa_vision.identify.constellation import LOOSE_SIGMA, Known
 from rsa_vision.identify.hidden import Sighting, find_with_rays, hidden_markers
-from rsa_vision.identify.poses import TOLERANCE_MM, Cloud, volume_mm3
-from rsa_vision.segments import Segment
+from rsa_vision.identify.poses import TOLERANCE_MM, Cloud, Pairs, place, volume_mm3
 from rsa_vision.settings import Limits
 from rsa_vision.sightlines import Sightlines, is_free
 from rsa_vision.tables import AXES, SCHEMAS, Row, Rows, split_name
 from rsa_vision.types import Float
 
+LEAST_RIGID: Final = 4  # markers that tell that nothing moved: three fit too easily
 PRESENT: Final = 0.98  # probability that a segment is on films that show another segment of its subject
 
 
@@ -95,20 +95,58 @@ def _free_rays(rows: Rows) -> RayBundle:
     return replace(rays.rows(free), covariance_mm2=factor**2 * rays.covariance_mm2[free])
 
 
-def hidden_of(segment: Segment, sighting: Sighting) -> list[HiddenMarker]:
-    """Return the markers that single images show, where the pose of their segment puts them."""
-    assert sighting.placement is not None
-    assert sighting.rays is not None
+def hidden_of(names: Sequence[str], body: Cloud, sighting: Sighting) -> list[HiddenMarker]:
+    """Return the markers of a body that single images show, where its pose puts them."""
+    if sighting.placement is None or sighting.rays is None:
+        return []
     markers = sorted({i for i, _ in sighting.sights})
-    place_mm, by_pose = sighting.placement.predict(segment.position_mm[markers].reshape(-1, 3))
+    some = body.rows(np.array(markers, np.int64))
+    place_mm, by_pose = sighting.placement.predict(some.position_mm)
+    own = sighting.placement.rotation @ some.covariance_mm2 @ sighting.placement.rotation.T
     result = []
     for k, i in enumerate(markers):
         views = [r for marker, r in sighting.sights if marker == i]
         images = {int(sighting.rays.image[r]): (int(sighting.rays.focus[r]), sighting.rays.rows(np.array([r]))) for r in views}
         flags = int(MarkerFlag.PREDICTED | (MarkerFlag.ONE_VIEW if len(views) == 1 else 0))
-        covariance = by_pose[k] + TOLERANCE_MM**2 * np.eye(3)
-        result.append(HiddenMarker(f"{segment.name}/{segment.markers[i]}", place_mm[k], covariance, images, flags))
+        covariance = by_pose[k] + own[k] + TOLERANCE_MM**2 * np.eye(3)
+        result.append(HiddenMarker(names[i], place_mm[k], covariance, images, flags))
     return result
+
+
+def hidden_since(
+    rows: Rows, before: Cloud, names: Sequence[str], cloud: Cloud, found: Pairs, missing: Collection[str], limits: Limits
+) -> list[HiddenMarker]:
+    """Return markers of an earlier examination that single images show, where nothing has moved against anything since.
+
+    Parameters
+    ----------
+    rows : dict
+        Tables of the examination.
+    before : Cloud
+        Markers of the earlier one.
+    names : sequence of str
+        Of these.
+    cloud : Cloud
+        Points of the examination.
+    found : tuple of (earlier marker, point)
+        Markers found again.
+    missing : collection of str
+        Names of those that were not.
+    limits : Limits
+        ``posterior`` is used.
+
+    Returns
+    -------
+    list of HiddenMarker
+        None if the markers found are no one rigid body: then nothing tells to which part of them a missing one belongs.
+    """
+    lost = {i for i, name in enumerate(names) if name in missing}
+    rays = _free_rays(rows)
+    placement = place(before, cloud, found) if len(found) >= LEAST_RIGID else None
+    if placement is None or (placement.sigmas > LOOSE_SIGMA).any() or not lost or not len(rays):
+        return []
+    sighting = hidden_markers(before, cloud, found, placement, rays, lost, max(volume_mm3(before), volume_mm3(cloud)), limits.posterior)
+    return hidden_of(names, before, replace(sighting, rays=rays)) if sighting.decisive else []
 
 
 def predicted_row(exam: Row, hidden: HiddenMarker) -> Row:

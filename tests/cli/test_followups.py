@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rsa_vision
 from rsa_vision.cli import run_app
@@ -16,10 +18,12 @@ from rsa_vision.errors import SettingsError
 from rsa_vision.followup import follow_up
 from rsa_vision.segments import Segment, read_segments
 from rsa_vision.settings import Limits
+from rsa_vision.sightlines import Sightlines
 from rsa_vision.tables import SCHEMAS
 from rsa_vision.types import MarkerImages
 from synthetic.study import make_study
 from tests.cli.conftest import SD_PX, content
+from tests.identify.bodies import seen_from
 
 TEXT = {"subject": pl.String, "exam": pl.String, "segment": pl.String, "marker": pl.String, "flags": pl.String, "number": pl.String}
 FIRST, SECOND, THIRD = "202601010900", "202601020900", "202601030900"
@@ -257,3 +261,28 @@ def test_segments_that_cannot_be_used_are_refused_with_every_error(text: str, sa
 def test_proposals_need_two_examinations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(["segments", "propose", str(tmp_path)]) == 2
     assert "no results" in capsys.readouterr().err
+
+
+def test_a_marker_hidden_without_segments_has_no_place_where_bodies_moved(films: Path, hide: Any, tmp_path: Path) -> None:
+    hide((SECOND, 2, "bone/3"))
+    assert run_app(["measure", str(films), "-o", str(tmp_path)]) == 1
+    (lost,) = read(tmp_path / "markers.csv").filter(pl.col("x_mm").is_null()).to_dicts()  # nothing tells with which body it moved
+    assert (lost["exam"], lost["flags"]) == (SECOND, "missing")
+
+
+def test_a_marker_hidden_without_segments_is_predicted_where_nothing_moved() -> None:
+    rng = np.random.default_rng(3)
+    body, turn = rng.normal([0, 100, 150], 20, (6, 3)), Rotation.from_rotvec([0.1, -0.2, 0.1])
+    moved = turn.apply(body) + np.array([3, -2, 1])
+    first, second = rows_of("1", body), rows_of("2", moved[:5])
+    ray = seen_from(rng, moved[5:], np.array([0]), 0.01)
+    image = dict.fromkeys(SCHEMAS["images"]) | {"focus": 1, "role": "unassigned", "number": "", "shape": "ball", "flags": ""}
+    for shift, names in ((0.0, {"P01", "P02", "P03", "P04", "P05", "P06"}), (1.0, {"P01", "P02", "P03", "P04", "P05"})):
+        shifted = replace(ray, through_mm=ray.through_mm + np.array([shift, 0, 0]))
+        seen = {**second, "images": [image], **Sightlines(shifted, (), np.zeros(0)).rows()}
+        _, named = follow_up([first, seen], None, Limits())
+        assert {row["marker"] for row in named["markers"] if row["x_mm"] is not None} == names
+        (row,) = (row for row in named["markers"] if row["marker"] == "P06")
+        assert row["flags"] == ("missing" if shift else "one-view;predicted")
+        assert named["exams"][0]["status"] == ("ok" if shift else "review")
+        assert shift or np.abs(np.array([row["x_mm"], row["y_mm"], row["z_mm"]]) - moved[5]).max() < 0.3
