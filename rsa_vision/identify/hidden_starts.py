@@ -129,7 +129,9 @@ def _turned(scene: Scene, ends: tuple[int, int], places: tuple[Float, Float], pa
     (i, j), (base, end), body = ends, places, scene.body.position_mm
     line = end - base
     first, axis = _aligning(body[j] - body[i], line), line / np.linalg.norm(line)
-    turns = np.stack([rotation_by(axis * angle) @ first for angle in np.arange(TURNS) * 2 * np.pi / TURNS])
+    angle = (np.arange(TURNS) * 2 * np.pi / TURNS)[:, None, None]
+    by_axis = np.cross(np.eye(3), axis)  # the matrix of the product with it (Rodrigues)
+    turns = (np.eye(3) + np.sin(angle) * by_axis + (1 - np.cos(angle)) * by_axis @ by_axis) @ first
     moved = np.einsum("tij,nj->tni", turns, body - body[i]) + base  # (t, n, 3)
     off = np.linalg.norm(np.cross(moved[:, :, None] - scene.rays.through_mm, scene.rays.direction), axis=-1)  # (t, n, r)
     away = np.linalg.norm(moved[:, :, None] - scene.points.position_mm, axis=-1)

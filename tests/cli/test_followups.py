@@ -233,6 +233,21 @@ def test_reconstruct_names_points_by_segments(films: Path, tmp_path: Path) -> No
         assert all(given == true for given, true in names.items())
 
 
+def test_reconstruct_predicts_markers_that_are_named_at_one_focus_only(films: Path, tmp_path: Path) -> None:
+    points = read(films / "truth" / "images.csv").filter((pl.col("role") != "unassigned") & (pl.col("exam") == SECOND))
+    points = points.filter((pl.col("number") != "bone/3") | (pl.col("focus") == 1))
+    objects = {name: str(101 + k) for k, name in enumerate(sorted(points.filter(pl.col("role") == "object")["number"].unique()))}
+    points.with_columns(pl.col("number").replace(objects)).write_csv(tmp_path / "points.csv")
+    rsa_vision.reconstruct(tmp_path / "points.csv", tmp_path / "out", cage="2", segments=films / "truth" / "segments.csv")
+    markers = read(tmp_path / "out" / "markers.csv")
+    assert len(markers) == 11
+    (row,) = markers.filter(pl.col("flags").str.contains("predicted")).to_dicts()
+    assert (row["segment"], row["marker"], row["flags"]) == ("bone", "3", "one-view;predicted")
+    error = places(markers, SECOND)["bone/3"] - places(read(films / "truth" / "markers.csv"), SECOND)["bone/3"]
+    assert (np.abs(error) < [3 * row[f"sd_{axis}_mm"] for axis in "xyz"]).all()
+    assert exams(tmp_path / "out")[SECOND] == ("review", "marker-one-view")
+
+
 HEAD = "subject,segment,marker,x_mm,y_mm,z_mm\n"
 
 
