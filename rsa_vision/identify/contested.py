@@ -48,11 +48,8 @@ def settle(segments: Sequence[Cloud], sure: Cloud, candidates: Cloud, images: Se
     its candidates: a stray must exist as well, and counts with these alone.
     """
     n, first = len(candidates), len(sure)
-    points = Cloud(*(np.concatenate([getattr(sure, name), getattr(candidates, name)]) for name in ("position_mm", "covariance_mm2")))
-    apart = _at_once(images, log_odds)
-    volume = volume_mm3(
-        Cloud(*(np.concatenate([getattr(sure, f), getattr(candidates, f)[apart]]) for f in ("position_mm", "covariance_mm2")))
-    )
+    points, apart = _joined(sure, candidates), _at_once(images, log_odds)
+    volume = volume_mm3(_joined(sure, candidates.rows(apart)))
     stray = STRAY + max(0, first + int(apart.sum()) - sum(map(len, segments)))
     image_of = {image: first + k for k, image in enumerate(sorted({i for one in images for i in one}))}
     claims = [tuple(image_of[i] for i in one) for one in images]  # strays, then what a segment claims at once
@@ -70,6 +67,11 @@ def settle(segments: Sequence[Cloud], sure: Cloud, candidates: Cloud, images: Se
     for mine, chance in zip(members, chances.tolist(), strict=True):
         result[mine] += chance
     return result
+
+
+def _joined(one: Cloud, other: Cloud) -> Cloud:
+    places, covariances = (one.position_mm, other.position_mm), (one.covariance_mm2, other.covariance_mm2)
+    return Cloud(np.concatenate(places), np.concatenate(covariances))
 
 
 def _possible(segment: Cloud, points: Cloud, volume: float, stray: float, images: Sequence[tuple[int, ...]]) -> list[tuple[float, Pairs]]:
