@@ -229,7 +229,8 @@ def _whitened(jacobian: Float, n: int) -> Float:
 
 @lru_cache(maxsize=4)
 def _screen_factor(n: int) -> tuple[Float, bool]:
-    return cho_factor(_screen_covariance(n) + 1e-9 * np.eye(n * n))  # type: ignore[no-any-return]
+    factor: tuple[Float, bool] = cho_factor(_screen_covariance(n) + 1e-9 * np.eye(n * n))
+    return factor
 
 
 def _response_slope(response: Response) -> float:

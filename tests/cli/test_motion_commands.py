@@ -105,12 +105,19 @@ def test_a_motion_that_is_not_ok_is_said_and_ends_with_1(markers: Path, capsys: 
     assert rsa_vision.motion(markers, reference="femur").exit_code == 1
 
 
-@pytest.mark.parametrize("separator", [";", "\t"])
-def test_tables_of_other_programs_are_read_with_their_separator(markers: Path, separator: str) -> None:
+def test_an_eos_style_table_with_semicolons_decimal_commas_and_a_byte_order_mark_is_read(markers: Path) -> None:
+    header, *lines = [line.replace(",", ";").replace(".", ",") for line in markers.read_text().splitlines()]
+    assert header.startswith("subject;exam;segment;marker;x_mm;y_mm;z_mm;")
+    other = markers.with_name("eos.csv")
+    names = "Patient ID;Exam date;Body;Point;X [mm];Y [mm];Z [mm];" + header.split(";", 7)[7]
+    other.write_bytes("\r\n".join(["\ufeff" + names, *lines, ""]).encode())
+    assert rsa_vision.motion(other).table.equals(rsa_vision.motion(markers).table)
+
+
+def test_a_table_with_tabs_is_read(markers: Path) -> None:
     other = markers.with_name("other.csv")
-    text = markers.read_text().replace(",", separator)
-    other.write_text("\ufeff" + (text.replace(".", ",") if separator == ";" else text), encoding="utf-8")
-    assert np.allclose(rsa_vision.motion(other).table["tx_mm"], rsa_vision.motion(markers).table["tx_mm"])
+    other.write_text(markers.read_text().replace(",", "\t"))
+    assert rsa_vision.motion(other).table.equals(rsa_vision.motion(markers).table)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from rsa_vision import api
 from rsa_vision.motion_reasons import MOTION_REASONS
-from rsa_vision.motion_tables import MOTION
+from rsa_vision.motion_tables import MOTION, MOTION_SCHEMAS
 from rsa_vision.settings import Study
 
 from .test_pages import codes, page, rows, section, toml_blocks
@@ -33,6 +33,11 @@ def test_every_column_of_motion() -> None:
     known = {name for name in MOTION if not name.startswith(("sd_", "consistent_"))}
     assert known <= listed
     assert listed - {"sd_...", "consistent_..."} <= set(MOTION)
+
+
+def test_every_column_of_the_other_tables() -> None:
+    listed = {codes(row[0])[0].removesuffix(".csv"): codes(row[1]) for row in rows(section("motion.md", "The other tables"))}
+    assert listed | {"motion": list(MOTION)} == {name: list(schema) for name, schema in MOTION_SCHEMAS.items()}
 
 
 def test_every_reason_of_motion() -> None:
