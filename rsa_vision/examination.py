@@ -21,6 +21,7 @@ from rsa_vision.identify.pairs import Pairing, pair_rays
 from rsa_vision.images import require_pitch
 from rsa_vision.readings import FilmReading, Readings, candidates, image_quality, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Study
+from rsa_vision.sightlines import Sightlines, by_cage, by_cameras, left_open, single_images
 from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
 from rsa_vision.xray import rays_of, reconstruct, reconstruct_calibrated, solve_focus
@@ -50,6 +51,8 @@ class ExaminationResult:
     method : str
     seconds : mapping
         Time by stage.
+    sightlines : Sightlines
+        What the films leave open.
     """
 
     films: tuple[FilmReading, ...]
@@ -59,6 +62,7 @@ class ExaminationResult:
     verdict: Verdict
     method: str = "selvik"
     seconds: Mapping[str, float] = field(default_factory=dict)
+    sightlines: Sightlines = field(default_factory=Sightlines.none)
 
 
 def measure_examination(
@@ -146,11 +150,13 @@ def reconstruct_points(points: ImagePoints, study: Study, cage: Cage) -> Examina
         Without films.
     """
     try:
-        reconstruction = reconstruct(points, cage.at_temperature(study.temperature_c), study.limits)
+        at_exam = cage.at_temperature(study.temperature_c)
+        reconstruction = reconstruct(points, at_exam, study.limits)
     except RsaError as error:
         return ExaminationResult((), points, None, None, conclude([(error.code, str(error))]))
     verdict = conclude(judge(reconstruction, _nominal(study, cage), study.limits))
-    return ExaminationResult((), reconstruction.points, None, reconstruction, verdict)
+    sightlines = single_images(reconstruction, by_cage(reconstruction, at_exam))
+    return ExaminationResult((), reconstruction.points, None, reconstruction, verdict, sightlines=sightlines)
 
 
 def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> ExaminationResult:
@@ -177,7 +183,8 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
     complete = name_objects(named, table, bundle, pairing, foreign)
     reconstruction = reconstruct(complete.points, cage, study.limits, TIP_ERROR)
     findings += _pair_findings(pairing, study) + lonely_images(table, pairing, bundle)
-    return _judged(complete, reconstruction, findings + judge(reconstruction, _nominal(study, cage), study.limits))
+    result = _judged(complete, reconstruction, findings + judge(reconstruction, _nominal(study, cage), study.limits))
+    return replace(result, sightlines=left_open(result.points, complete.rows, bundle, pairing, by_cage(reconstruction, cage)))
 
 
 def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) -> ExaminationResult:
@@ -205,7 +212,8 @@ def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) 
     if not pairing.groups:
         return _failed(complete, [*findings, ("cage-not-found", "no image of one film meets one of the other: look at the calibration")])
     reconstruction = reconstruct_calibrated(complete.points, cameras, study.limits)
-    return _judged(complete, reconstruction, findings + judge(reconstruction, {}, study.limits))
+    result = _judged(complete, reconstruction, findings + judge(reconstruction, {}, study.limits))
+    return replace(result, sightlines=left_open(result.points, complete.rows, bundle, pairing, by_cameras(reconstruction, cameras)))
 
 
 def _pair(

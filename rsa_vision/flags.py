@@ -6,6 +6,7 @@ A flag tells about one image point or one marker, a reason about one examination
 from __future__ import annotations
 
 from enum import IntFlag
+from functools import lru_cache
 from typing import Final
 
 
@@ -26,6 +27,7 @@ class MarkerFlag(IntFlag):
     NO_COVARIANCE = 1024  # the input gave no covariance
     FOREIGN_MARK = 2048  # a cage mark that this focus is not meant to see; explained, not used
     LOOSE = 4096  # not where the other markers of its rigid body say
+    MISSING = 8192  # a marker that the subject has, of which nothing was found here
 
 
 def flag_names(value: int) -> str:
@@ -44,6 +46,7 @@ def flag_names(value: int) -> str:
     return ";".join(flag.name.lower().replace("_", "-") for flag in MarkerFlag if flag & value and flag.name)
 
 
+@lru_cache(maxsize=1024)
 def flag_value(names: str) -> int:
     """Return the flags with these names, the inverse of :func:`flag_names`; words that are no flags count for nothing."""
     wanted = {name.strip() for name in names.split(";")}

@@ -12,33 +12,21 @@ from typing import Final
 
 import numpy as np
 
+from rsa_vision.contests import cloud_of, settle_pairs
 from rsa_vision.flags import MarkerFlag, flag_names, flag_value
-from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.constellation import LOOSE_SIGMA, Known, match_bodies, match_segments
-from rsa_vision.identify.hidden import Sighting, find_with_rays, hidden_markers
-from rsa_vision.identify.poses import TOLERANCE_MM, Cloud, place, volume_mm3
+from rsa_vision.identify.hidden import Sighting
+from rsa_vision.identify.poses import Cloud, place
+from rsa_vision.ordering import natural_key
 from rsa_vision.segments import Segment, Segments, segments_of
 from rsa_vision.settings import Limits
-from rsa_vision.sightlines import free_rays
-from rsa_vision.tables import SCHEMAS, Row, Rows, split_name
-from rsa_vision.types import Float
+from rsa_vision.sighted import HiddenMarker, find_sightings, hidden_of, hidden_since, image_row, missing_row, predicted_row
+from rsa_vision.tables import Row, Rows, name_of, split_name
 from rsa_vision.verdict import Finding, conclude
 
 UNRELATED: Final = 8  # markers of which not one is found again, nor nearly: another object, not one whose few markers moved
 MOST_EARLIER: Final = 6  # examinations that one is compared with: the first, and the last ones before it
-AXES: Final = ("x_mm", "y_mm", "z_mm")
-
-
-@dataclass(frozen=True, eq=False)
-class _Hidden:
-    """A marker without rays of its own from two foci: its place by its segment, and its images with their focus and ray."""
-
-    name: str
-    place_mm: Float
-    covariance_mm2: Float
-    images: Mapping[int, tuple[int, RayBundle]]
-    flags: int
 
 
 @dataclass(eq=False)
@@ -51,8 +39,11 @@ class _Exam:
     names: list[str] = field(default_factory=list)  # of these, empty where unknown
     flags: list[int] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
-    hidden: list[_Hidden] = field(default_factory=list)
+    hidden: list[HiddenMarker] = field(default_factory=list)
+    missing: set[str] = field(default_factory=set)  # known markers that were not found
+    unsure: set[str] = field(default_factory=set)  # names that may be second ones of a marker
     note: str = ""  # what a reader should know though nothing is wrong
+    told: str = ""  # likewise, of its pairs
 
 
 def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) -> list[Rows]:
@@ -84,8 +75,10 @@ def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) 
         for index in indices:
             if exams[index]["exams"][0]["status"] == "failed":
                 continue
-            exam = _open(exams[index])
+            rows = exams[index] if known is None else settle_pairs(exams[index], known, limits)
+            exam = _open(rows)
             if known is not None:
+                exam.told = _settled(exams[index], rows)
                 _name_by_segments(exam, known, limits)
             used = _name_by_earlier(exam, earlier, used, limits)
             earlier.append(exam)
@@ -93,20 +86,18 @@ def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) 
     return result
 
 
-def cloud_of(markers: Sequence[Row]) -> Cloud:
-    """Return rows of ``markers.csv`` that have coordinates as points with their covariances (0 where there is none)."""
-    position = np.array([[row[axis] for axis in AXES] for row in markers], dtype=np.float64).reshape(-1, 3)
-    covariance = np.zeros((len(markers), 3, 3))
-    for i, row in enumerate(markers):
-        sd = np.array([row[f"sd_{axis}"] or 0.0 for axis in AXES])
-        xy, xz, yz = (row[f"cov_{pair}_mm2"] or 0.0 for pair in ("xy", "xz", "yz"))
-        covariance[i] = np.diag(sd**2) + np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
-    return Cloud(position, covariance)
-
-
 def _open(rows: Rows) -> _Exam:
-    located = [row for row in rows["markers"] if row["x_mm"] is not None]
+    found = [row for row in rows["markers"] if not flag_value(row["flags"] or "") & MarkerFlag.MISSING]
+    rows = {**rows, "markers": found}
+    located = [row for row in found if row["x_mm"] is not None]
     return _Exam(rows, located, cloud_of(located), [""] * len(located), [0] * len(located))
+
+
+def _settled(before: Rows, after: Rows) -> str:
+    doubts = "pair-ambiguous" in before["exams"][0]["reasons"].split(";")
+    if not doubts or "pair-ambiguous" in after["exams"][0]["reasons"].split(";"):
+        return ""
+    return "the known segments decide the doubtful pairs"
 
 
 def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) -> None:
@@ -115,75 +106,30 @@ def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) 
         return
     bodies = [Cloud.exact(segment.position_mm) for segment in segments]
     matched = match_segments(bodies, exam.cloud, limits.posterior)
-    sightings = _sightings(exam, bodies, matched, limits)
-    for segment, known, sighting in zip(segments, matched, sightings, strict=True):
+    sightings = find_sightings(exam.rows, exam.cloud, bodies, matched, limits)
+    for segment, body, known, sighting in zip(segments, bodies, matched, sightings, strict=True):
         for i, a in (*known.pairs, *known.loose, *sighting.pairs):
             exam.names[a] = f"{segment.name}/{segment.markers[i]}"
         for _, a in known.loose:
             exam.flags[a] |= MarkerFlag.LOOSE
+        if known.placement is None and sighting.placement is not None:
+            known = replace(known, doubtful=())  # single rays decided
         for _, a in known.doubtful:
             exam.flags[a] |= MarkerFlag.AMBIGUOUS
-        seen = {i for i, _ in (*sighting.pairs, *sighting.sights)}
-        lost = tuple(i for i in known.lost if i not in seen)
+        seen = {i for i, _ in (*known.pairs, *known.doubtful, *known.loose, *sighting.pairs, *sighting.sights)}
+        lost = tuple(i for i in range(len(segment.markers)) if i not in seen)
+        exam.missing |= {f"{segment.name}/{segment.markers[i]}" for i in (*lost, *(i for i, _ in known.doubtful))}
         exam.findings += _segment_findings(segment, replace(known, lost=lost), sighting, limits)
         if sighting.placement is not None:
-            exam.hidden += _hidden(segment, sighting, exam)
+            exam.hidden += hidden_of([f"{segment.name}/{marker}" for marker in segment.markers], body, sighting)
     if "pair-ambiguous" in exam.rows["exams"][0]["reasons"].split(";"):
         doubted = [a for a, row in enumerate(exam.located) if flag_value(row["flags"] or "") & MarkerFlag.AMBIGUOUS]
         agreed = [exam.names[a] for a in doubted if exam.names[a] and not exam.flags[a]]
         if agreed:
             exam.findings.append(("pair-ambiguous", f"the doubtful pairs of {', '.join(agreed)} agree with the constellation"))
-    extra = [_name(row) for row, name in zip(exam.located, exam.names, strict=True) if not name]
+    extra = [name_of(row) for row, name in zip(exam.located, exam.names, strict=True) if not name]
     if extra:
         exam.findings.append(("marker-mismatch", f"{len(extra)} markers belong to no known segment"))
-
-
-def _sightings(exam: _Exam, bodies: Sequence[Cloud], matched: Sequence[Known], limits: Limits) -> list[Sighting]:
-    """Look for the markers that are missing among single images; what two segments claim goes to neither."""
-    rays = free_rays(exam.rows)
-    nothing = Sighting((), (), None, decisive=True)
-    if not len(rays):
-        return [nothing] * len(bodies)
-    volume = max(volume_mm3(cloud) for cloud in (exam.cloud, *bodies))
-    taken = {a for known in matched for _, a in (*known.pairs, *known.loose, *known.doubtful)}
-    free = np.array([a for a in range(len(exam.cloud)) if a not in taken], dtype=np.int64)
-    found = []
-    for body, known in zip(bodies, matched, strict=True):
-        if known.placement is not None:
-            seen = known.pairs if not known.loose else tuple(pair for pair in known.pairs if pair not in known.loose)
-            missing = set(known.lost)
-            sighting = hidden_markers(body, exam.cloud, seen, known.placement, rays, missing, volume, limits.posterior)
-        elif not known.doubtful:
-            sighting = find_with_rays(body, exam.cloud.rows(free), rays, volume, limits.posterior)
-            sighting = replace(sighting, pairs=tuple((i, int(free[a])) for i, a in sighting.pairs))
-        else:
-            sighting = nothing
-        found.append(sighting if sighting.decisive else replace(nothing, decisive=False))
-    claims = [claim for one in found for claim in {("image", rays.image[r]) for _, r in one.sights} | {("point", a) for _, a in one.pairs}]
-    return [
-        replace(nothing, decisive=False)
-        if any(
-            claims.count(claim) > 1 for claim in [*(("image", rays.image[r]) for _, r in one.sights), *(("point", a) for _, a in one.pairs)]
-        )
-        else replace(one, sights=tuple((i, int(r)) for i, r in one.sights), rays=rays)
-        for one in found
-    ]
-
-
-def _hidden(segment: Segment, sighting: Sighting, exam: _Exam) -> list[_Hidden]:
-    """Return the markers that single images show, where the pose of their segment puts them."""
-    assert sighting.placement is not None
-    assert sighting.rays is not None
-    markers = sorted({i for i, _ in sighting.sights})
-    place_mm, by_pose = sighting.placement.predict(segment.position_mm[markers].reshape(-1, 3))
-    result = []
-    for k, i in enumerate(markers):
-        views = [r for marker, r in sighting.sights if marker == i]
-        images = {int(sighting.rays.image[r]): (int(sighting.rays.focus[r]), sighting.rays.rows(np.array([r]))) for r in views}
-        flags = int(MarkerFlag.PREDICTED | (MarkerFlag.ONE_VIEW if len(views) == 1 else 0))
-        covariance = by_pose[k] + TOLERANCE_MM**2 * np.eye(3)
-        result.append(_Hidden(f"{segment.name}/{segment.markers[i]}", place_mm[k], covariance, images, flags))
-    return result
 
 
 def _segment_findings(segment: Segment, known: Known, sighting: Sighting, limits: Limits) -> list[Finding]:
@@ -235,12 +181,32 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
     for a in new:
         used += 1
         exam.names[left[a]] = f"P{used:02d}"
+    if exam.missing:  # of known segments: these may be they
+        exam.unsure |= {exam.names[left[a]] for a in new}
     if earlier and not agreed and not doubtful.any() and len(new) >= UNRELATED:
         exam.note = f"another object than in the earlier examinations: none of its {len(new)} markers is among theirs"
     elif earlier:
         known = {name for other in earlier for name in other.names if not split_name(name)[0]}
+        exam.missing |= known - set(exam.names) - {name for other in earlier for name in other.unsure}
         exam.findings += _earlier_findings(exam, [left[a] for a in new], [left[a] for a in new if doubtful[a]], known)
+        _name_hidden(exam, earlier[0], limits)
     return used
+
+
+def _name_hidden(exam: _Exam, first: _Exam, limits: Limits) -> None:
+    """Name single images that show markers of the first examination."""
+    free = [i for i, name in enumerate(first.names) if not split_name(name)[0]]
+    names = [first.names[i] for i in free]
+    found = tuple((names.index(name), a) for a, name in enumerate(exam.names) if name in names)
+    before = first.cloud.rows(np.array(free, dtype=np.int64))
+    used = {index for one in exam.hidden for index in one.images}
+    hidden = hidden_since(exam.rows, before, names, exam.cloud, tuple(sorted(found)), exam.missing, limits)
+    hidden = [one for one in hidden if not used & set(one.images)]
+    exam.hidden += hidden
+    exam.missing -= {one.name for one in hidden}
+    if hidden:
+        told = ", ".join(one.name for one in hidden)
+        exam.findings.append(("marker-one-view", f"{told} seen from one focus only, predicted by the first examination"))
 
 
 def _earlier_findings(exam: _Exam, new: Sequence[int], doubtful: Sequence[int], known: set[str]) -> list[Finding]:
@@ -251,6 +217,7 @@ def _earlier_findings(exam: _Exam, new: Sequence[int], doubtful: Sequence[int], 
     if loose:
         findings.append(("marker-loose", f"{', '.join(loose)} not where the others of the same rigid group say"))
     if new and missing:
+        exam.unsure |= {exam.names[a] for a in new}
         for a in doubtful:
             exam.flags[a] |= MarkerFlag.AMBIGUOUS
         why = f"{told} may be {', '.join(missing)} of earlier examinations: too few markers keep their distances to tell"
@@ -262,47 +229,35 @@ def _earlier_findings(exam: _Exam, new: Sequence[int], doubtful: Sequence[int], 
 
 def _renamed(exam: _Exam) -> Rows:
     """Return the rows with the names that were found; markers without coordinates keep theirs unless it is given away."""
-    names = {_name(row): name for row, name in zip(exam.located, exam.names, strict=True)}
+    names = {name_of(row): name for row, name in zip(exam.located, exam.names, strict=True)}
     taken = set(exam.names)
     for row in exam.rows["markers"]:
         if row["x_mm"] is None:
-            names[_name(row)] = _free(_name(row), taken)
-            taken.add(names[_name(row)])
-    flags = dict(zip(map(_name, exam.located), exam.flags, strict=True))
+            names[name_of(row)] = _free(name_of(row), taken)
+            taken.add(names[name_of(row)])
+    flags = dict(zip(map(name_of, exam.located), exam.flags, strict=True))
     markers = []
     for row in exam.rows["markers"]:
-        segment, marker = split_name(names[_name(row)])
-        markers.append({**row, "segment": segment, "marker": marker, "flags": _with_flags(row, flags.get(_name(row), 0))})
+        segment, marker = split_name(names[name_of(row)])
+        markers.append({**row, "segment": segment, "marker": marker, "flags": _with_flags(row, flags.get(name_of(row), 0))})
     images = [
         {**row, "number": names.get(row["number"], row["number"]), "flags": _with_flags(row, flags.get(row["number"], 0))}
         if row["role"] == "object"
         else row
         for row in exam.rows["images"]
     ]
+    about = exam.rows["exams"][0]
+    with_plane = any(row["role"] == "fiducial" for row in images)
     for hidden in exam.hidden:
-        markers.append(_predicted(exam.rows["exams"][0], hidden))
+        markers.append(predicted_row(about, hidden))
         for index, (focus, ray) in hidden.images.items():
-            images[index] = _seen(images[index], hidden, focus, ray)
+            images[index] = image_row(images[index], hidden, focus, ray, with_plane=with_plane)
+    given = {row["number"] for row in images}
+    markers = [row for row in markers if row["x_mm"] is not None or name_of(row) in given or not images]
+    markers += [missing_row(about, name) for name in sorted(exam.missing, key=natural_key)]
     row = _judged(exam.rows["exams"][0], exam.findings)
-    row["message"] = " | ".join(filter(None, [row["message"], exam.note]))
+    row["message"] = " | ".join(filter(None, [row["message"], exam.told, exam.note]))
     return {**exam.rows, "exams": [row], "images": images, "markers": markers}
-
-
-def _predicted(exam: Row, hidden: _Hidden) -> Row:
-    segment, marker = split_name(hidden.name)
-    row: Row = dict.fromkeys(SCHEMAS["markers"]) | {"subject": exam["subject"], "exam": exam["exam"], "segment": segment, "marker": marker}
-    cov = hidden.covariance_mm2
-    row |= dict(zip(AXES, hidden.place_mm.tolist(), strict=True))
-    row |= dict(zip((f"sd_{axis}" for axis in AXES), np.sqrt(np.diagonal(cov)).tolist(), strict=True))
-    row |= {"cov_xy_mm2": float(cov[0, 1]), "cov_xz_mm2": float(cov[0, 2]), "cov_yz_mm2": float(cov[1, 2])}
-    return row | {"n_views": len(hidden.images), "flags": flag_names(hidden.flags)}
-
-
-def _seen(row: Row, hidden: _Hidden, focus: int, ray: RayBundle) -> Row:
-    through = ray.through_mm[0]
-    away = float(np.linalg.norm(np.cross(hidden.place_mm - through, ray.direction[0])))
-    named = {"focus": focus, "role": "object", "number": hidden.name, "residual_um": 1000 * away, "used": True}
-    return {**row, **named, **dict(zip(AXES, through.tolist(), strict=True)), "flags": _with_flags(row, int(MarkerFlag.ONE_VIEW))}
 
 
 def _free(name: str, taken: set[str]) -> str:
@@ -323,7 +278,3 @@ def _judged(row: Row, findings: Sequence[Finding]) -> Row:
     verdict = conclude([*((code, row["message"]) for code in filter(None, row["reasons"].split(";"))), *findings])
     messages = [*filter(None, [row["message"]]), *(message for _, message in findings if message not in (row["message"] or ""))]
     return {**row, "status": verdict.status, "reasons": ";".join(verdict.reasons), "message": " | ".join(dict.fromkeys(messages))}
-
-
-def _name(row: Row) -> str:
-    return f"{row['segment']}/{row['marker']}" if row["segment"] else str(row["marker"])

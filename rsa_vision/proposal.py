@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rsa_vision.contests import cloud_of
 from rsa_vision.errors import GeometryError
-from rsa_vision.followup import cloud_of
 from rsa_vision.geometry.rigid import fit_rigid
 from rsa_vision.identify.groups import SMALLEST, rigid_groups
 from rsa_vision.identify.poses import Cloud

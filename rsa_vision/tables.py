@@ -19,6 +19,7 @@ Row = dict[str, Any]
 Rows = dict[str, list[Row]]
 
 METHOD: Final = "selvik"
+AXES: Final = ("x_mm", "y_mm", "z_mm")
 
 TEXT, NUMBER, WHOLE, TRUTH = pl.String(), pl.Float64(), pl.Int64(), pl.Boolean()
 
@@ -62,7 +63,7 @@ def frame(rows: Iterable[Row], schema: Mapping[str, pl.DataType]) -> pl.DataFram
     -------
     polars.DataFrame
     """
-    finite = ({name: _plain(row.get(name)) for name in schema} for row in rows)
+    finite = ({name: plain(row.get(name)) for name in schema} for row in rows)
     return pl.DataFrame(list(finite), schema=dict(schema), orient="row")
 
 
@@ -81,7 +82,7 @@ def examination_rows(subject: str, exam: str, files: Iterable[str], result: Exam
     Returns
     -------
     dict of str to list of dict
-        By table, values as plain Python numbers, empty as None.
+        By table, values as plain Python numbers, empty as None; and, for :mod:`rsa_vision.followup`, what the films leave open.
     """
     key = {"subject": subject, "exam": exam}
     markers = result.reconstruction.markers if result.reconstruction else None
@@ -100,8 +101,9 @@ def examination_rows(subject: str, exam: str, files: Iterable[str], result: Exam
     tables: Rows = {"exams": [key | row], "images": [key | point for point in _image_rows(result)], "foci": [], "markers": []}
     if result.reconstruction:
         tables["foci"] = [key | _focus_row(focus) for focus in result.reconstruction.foci]
-        tables["markers"] = [key | marker for marker in _marker_rows(result.reconstruction.markers)]
-    return {name: [{column: _plain(value) for column, value in row.items()} for row in rows] for name, rows in tables.items()}
+        tables["markers"] = [key | marker for marker in marker_rows(result.reconstruction.markers)]
+    finite = {name: [{column: plain(value) for column, value in row.items()} for row in rows] for name, rows in tables.items()}
+    return finite | result.sightlines.rows()
 
 
 def failed_rows(
@@ -127,7 +129,13 @@ def split_name(name: str) -> tuple[str, str]:
     return segment, marker
 
 
-def _plain(value: Any) -> Any:
+def name_of(marker: Row) -> str:
+    """Return the name of a row of ``markers.csv`` as images have it, the inverse of :func:`split_name`."""
+    return f"{marker['segment']}/{marker['marker']}" if marker["segment"] else str(marker["marker"])
+
+
+def plain(value: Any) -> Any:
+    """Return a value of numpy as Python's, what is not finite as None."""
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -166,7 +174,8 @@ def _focus_row(focus: FocusSolution) -> Row:
     return row | dict(zip(("sd_x_mm", "sd_y_mm", "sd_z_mm"), np.sqrt(np.diagonal(focus.covariance_mm2)), strict=True))
 
 
-def _marker_rows(markers: Markers) -> Iterable[Row]:
+def marker_rows(markers: Markers) -> Iterable[Row]:
+    """Return the columns of ``markers.csv`` for every marker, but for subject and examination."""
     for i, name in enumerate(markers.name):
         segment, marker = split_name(str(name))
         cov = markers.covariance_mm2[i]

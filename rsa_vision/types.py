@@ -226,6 +226,8 @@ class Reconstruction:
     markers : Markers
     controls : Markers
         Control points that more than one focus sees, re-computed as object points; their errors are a check (``name`` is the cage number).
+    calibration_px : float
+        Error of calibrated cameras that the crossings show.
     """
 
     points: ImagePoints
@@ -235,3 +237,4 @@ class Reconstruction:
     foci: tuple[FocusSolution, ...]
     markers: Markers
     controls: Markers
+    calibration_px: float = 0.0

@@ -23,6 +23,7 @@ __all__ = [
     "calibration_error",
     "check_controls",
     "crossing_factor",
+    "intersect",
     "rays_of",
     "reconstruct",
     "reconstruct_calibrated",
@@ -78,8 +79,8 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits, tip_error: floa
         flags[rows] |= fit.flags
         bundles.append(rays_of(points.position_px[rows], points.covariance_px2[rows], fit.solution, cage, rows, fit.focus_by_image))
     bundle = _joined(bundles)
-    markers, distance, flags = _intersect(_object_groups(points, bundle), bundle, flags, limits)
-    markers = replace(markers, covariance_mm2=markers.covariance_mm2 * crossing_factor(markers) ** 2)
+    markers, distance, flags = intersect(_object_groups(points, bundle), bundle, flags, limits)
+    markers = replace(markers, covariance_mm2=markers.covariance_mm2 * crossing_factor(markers.crossing_um, markers.crossing_sd_um) ** 2)
     objects = points.role == "object"
     residual[objects] = distance[objects]
     used |= objects & np.isfinite(distance)
@@ -88,7 +89,7 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits, tip_error: floa
         if used[row] and points.role[row] == "control":
             common.setdefault(str(mark[row]), []).append(ray)
     shared = {str(cage.mark[int(index)].number): rays for index, rays in common.items() if len(rays) > 1}
-    controls = _intersect(shared, bundle, flags, limits)[0]
+    controls = intersect(shared, bundle, flags, limits)[0]
     solutions = tuple(fit.solution for fit in fits.values())
     return Reconstruction(_flagged(points, flags), plane, residual, used, solutions, markers, controls)
 
@@ -124,21 +125,22 @@ def reconstruct_calibrated(points: ImagePoints, cameras: Mapping[int, Pinhole], 
     unknown = ~np.isfinite(points.covariance_px2).all(axis=(1, 2))
     flags = (points.flags & ~int(DERIVED)) | np.where(unknown, MarkerFlag.NO_COVARIANCE, MarkerFlag.NONE)
 
-    def intersect(calibration_px: float) -> tuple[Markers, Float, Int]:
+    def at_error(calibration_px: float) -> tuple[Markers, Float, Int]:
         bundles = []
         for focus in _foci(points):
             rows = np.flatnonzero(points.focus == focus)
             px, covariance = points.position_px[rows], points.covariance_px2[rows]
             bundles.append(camera_rays(cameras[focus], focus, px, covariance, rows, calibration_px=calibration_px))
         bundle = _joined(bundles)
-        return _intersect(_object_groups(points, bundle), bundle, flags, limits)
+        return intersect(_object_groups(points, bundle), bundle, flags, limits)
 
-    markers, distance, flags = intersect(calibration_error(lambda error_px: intersect(error_px)[0]))
+    calibration_px = calibration_error(lambda error_px: at_error(error_px)[0])
+    markers, distance, flags = at_error(calibration_px)
     markers.parallax_um[:] = np.nan
     solutions = tuple(_camera_solution(focus, cameras[focus]) for focus in _foci(points))
     controls = markers.rows(np.zeros(len(markers), bool))
     plane = np.full((len(points), 3), np.nan)
-    return Reconstruction(_flagged(points, flags), plane, distance, np.isfinite(distance), solutions, markers, controls)
+    return Reconstruction(_flagged(points, flags), plane, distance, np.isfinite(distance), solutions, markers, controls, calibration_px)
 
 
 def calibration_error(markers_at: Callable[[float], Markers]) -> float:
@@ -172,12 +174,13 @@ def calibration_error(markers_at: Callable[[float], Markers]) -> float:
     return float(np.sqrt(low * high)) if low > 1e-3 else 0.0
 
 
-def crossing_factor(markers: Markers) -> float:
+def crossing_factor(crossing_um: Float, crossing_sd_um: Float) -> float:
     """Return the factor by which the crossing errors show the markers' standard deviations to be too small.
 
     Parameters
     ----------
-    markers : Markers
+    crossing_um, crossing_sd_um : ndarray of shape (n,)
+        Crossing errors of markers and their standard deviations; NaN where there is none.
 
     Returns
     -------
@@ -186,7 +189,7 @@ def crossing_factor(markers: Markers) -> float:
         median of the squared ratios of crossing errors and their standard deviations, against that of chi-square: single wrong pairs,
         which their own crossing errors show, leave the others alone.
     """
-    squares = (markers.crossing_um / markers.crossing_sd_um) ** 2
+    squares = (crossing_um / crossing_sd_um) ** 2
     squares = squares[np.isfinite(squares)]
     if len(squares) < _LEAST_FOR_CROSSINGS or chdtrc(len(squares), squares.sum()) > _UNEXPLAINED_P:
         return 1.0
@@ -285,8 +288,28 @@ def _object_groups(points: ImagePoints, bundle: RayBundle) -> Groups:
     return {number: sorted(rays, key=lambda ray: int(bundle.focus[ray])) for number, rays in groups.items()}
 
 
-def _intersect(groups: Groups, bundle: RayBundle, flags: Int, limits: Limits) -> tuple[Markers, Float, Int]:
-    """Step 3: markers, the distance in um of every image's ray from its marker, and the images' flags with what was found here."""
+def intersect(groups: Groups, bundle: RayBundle, flags: Int, limits: Limits) -> tuple[Markers, Float, Int]:
+    """Reconstruct markers from groups of rays (step 3).
+
+    Parameters
+    ----------
+    groups : dict of str to list of int
+        Rows of the bundle by the name of the marker, foci in rising order.
+    bundle : RayBundle
+        ``image`` counts the rows of `flags`.
+    flags : ndarray of int, shape (n,)
+        Of every image.
+    limits : Limits
+        ``crossing_sigma`` is used.
+
+    Returns
+    -------
+    markers : Markers
+    distance_um : ndarray of shape (n,)
+        Of every image's ray from its marker, NaN for images without one.
+    flags : ndarray of int, shape (n,)
+        With what was found here.
+    """
     names = np.array(list(groups), dtype=np.str_)
     n = len(names)
     position, covariance = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)

@@ -70,21 +70,10 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -
     """
     volume = volume_mm3(points)
     stray = STRAY + max(0, len(points) - sum(map(len, segments)))
-    owner: list[int] = []
-    groups: list[Pairs] = []
-    gain: list[float] = []
-    for index, segment in enumerate(segments):
-        n = len(segment)
-        rivals = [
-            (_odds(placement, len(pairs), volume, stray) + len(pairs) * np.log(FOUND) + (n - len(pairs)) * np.log(1 - FOUND), pairs)
-            for pairs, placement in candidate_poses(segment, points, float(np.log(volume / stray)))
-        ]
-        for odds, pairs in _likeliest(rivals):
-            owner.append(index)
-            groups.append(pairs)
-            gain.append(odds)
-    claims = [(*(a for _, a in pairs), len(points) + index) for pairs, index in zip(groups, owner, strict=True)]
-    packing = pack(claims, np.array(gain))
+    rivals = [(index, odds, pairs) for index, body in enumerate(segments) for odds, pairs in likely_groups(body, points, volume, stray)]
+    owner, groups = [index for index, _, _ in rivals], [pairs for _, _, pairs in rivals]
+    claims = [(*(a for _, a in pairs), len(points) + index) for index, _, pairs in rivals]
+    packing = pack(claims, np.array([odds for _, odds, _ in rivals]))
     chances = np.nan_to_num(packing.posterior)
     known = []
     for index, segment in enumerate(segments):
@@ -92,6 +81,32 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -
         best = next((groups[g] for g in mine if packing.chosen[g]), ())
         known.append(_known(segment, points, best, _names([groups[g] for g in mine], chances[mine]), posterior))
     return _with_loose(segments, points, known)
+
+
+def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) -> list[tuple[float, Pairs]]:
+    """List the assignments of a segment to points.
+
+    Parameters
+    ----------
+    segment, points : Cloud
+    volume : float
+        In which points may be, mm³.
+    stray : float
+        How many points are expected that belong to nothing known.
+
+    Returns
+    -------
+    list of (log odds, pairs)
+        Against all these points being strays, the likeliest first.
+    """
+    found = candidate_poses(segment, points, float(np.log(volume / stray)))
+    return _likeliest([(log_odds(len(segment), placement, pairs, volume, stray), pairs) for pairs, placement in found])
+
+
+def log_odds(n: int, placement: Placement, pairs: Pairs, volume: float, stray: float) -> float:
+    """Return the log odds of an assignment of a segment of n markers, as :func:`likely_groups` does."""
+    k = len(pairs)
+    return _odds(placement, k, volume, stray) + k * float(np.log(FOUND)) + (n - k) * float(np.log(1 - FOUND))
 
 
 def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[Pairs], Bool]:

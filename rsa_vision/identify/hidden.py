@@ -9,34 +9,30 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from itertools import permutations
 from typing import Final
 
 import numpy as np
 from scipy.special import logsumexp
 
 from rsa_vision.geometry.rays import RayBundle
+from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.constellation import FOUND, NEGLIGIBLE, STRAY
+from rsa_vision.identify.hidden_starts import Scene, Start, first_poses
 from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import (
     GATE,
-    GATE_SCALE,
     SCALES,
     TOLERANCE_MM,
     Cloud,
     Pairs,
     Placement,
-    distances,
     nearness,
-    rotation_by,
 )
 from rsa_vision.identify.ray_poses import off_rays, place_with_rays
 from rsa_vision.types import Bool, Float
 
-TURNS: Final = 90  # poses tried around the line through two known places
-COARSE_MM: Final = 3.0  # how near a ray must come to be tried then
-GRAZING_MM: Final = 0.5  # by which a ray may miss the sphere on which its marker lies
 MOST_TRIED: Final = 150
+SAME_MM: Final = 1.0  # by which the markers of one pose may differ
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,21 +56,6 @@ class Sighting:
     placement: Placement | None
     decisive: bool
     rays: RayBundle | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    body: Cloud
-    points: Cloud
-    rays: RayBundle
-    volume: float
-    stray: float
-
-    @property
-    def worth(self) -> tuple[float, float]:
-        """Log worth of a point (3-D) and of a ray (2-D) that need not be explained otherwise."""
-        area = self.volume ** (2 / 3)
-        return float(np.log(self.volume / self.stray)), float(np.log(area / (STRAY + len(self.rays))))
 
 
 def hidden_markers(
@@ -108,7 +89,7 @@ def hidden_markers(
     Sighting
         ``decisive`` is False where a ray may be of a missing marker, but not decisively.
     """
-    scene = _Scene(body, points, rays, volume, STRAY)
+    scene = Scene(body, points, rays, volume, STRAY)
     away, log_density = off_rays(body, rays, placement)
     marker, ray = np.nonzero(away < GATE)
     tried = [(int(i), int(r)) for i, r in zip(marker, ray, strict=True) if i in missing]
@@ -124,8 +105,17 @@ def hidden_markers(
     return Sighting(pairs, sights, together or placement, bool(together) and not (packing.chosen & ~sure).any())
 
 
-def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, posterior: float) -> Sighting:
-    """Find a segment with fewer than three markers seen from several foci: by these and by rays that belong to nothing.
+def find_with_rays(
+    body: Cloud,
+    points: Cloud,
+    rays: RayBundle,
+    volume: float,
+    posterior: float,
+    *,
+    around_mm: Float | None = None,
+    present: float = 0.5,
+) -> Sighting:
+    """Find a segment whose points alone do not tell its pose, with rays that belong to nothing, or by these alone.
 
     Parameters
     ----------
@@ -134,6 +124,10 @@ def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, p
     rays : RayBundle
     volume : float
     posterior : float
+    around_mm : ndarray of shape (k, 3), optional
+        Places of other markers: how deep along the rays to look. Default: anywhere from the film to near the foci.
+    present : float
+        Probability that the segment is on the films at all, before they are looked at.
 
     Returns
     -------
@@ -144,105 +138,92 @@ def find_with_rays(body: Cloud, points: Cloud, rays: RayBundle, volume: float, p
     -----
     Two places begin a hypothesis: points of two markers with their distance, or a point and where a ray pierces the sphere about it on
     which another marker must lie. The body is turned about the line through both, and where a third marker meets a ray its pose is fitted
-    and grown.
+    and grown. So is every pose at which three markers lie on three rays (:mod:`ray_triples`) and a fourth one near another. Beside each
+    assignment stand those in which a marker has another ray near it.
     """
-    scene = _Scene(body, points, rays, volume, STRAY + len(points))
-    starts = sorted(_starts(scene), key=lambda start: -start.met)
+    scene = Scene(body, points, rays, volume, STRAY + len(points))
+    starts = first_poses(scene, around_mm)
     found: dict[tuple[Pairs, Pairs], list[Placement]] = {}
+
+    def add(pairs: Pairs, sights: Pairs, placement: Placement) -> None:
+        same = found.setdefault((pairs, sights), [])
+        if not any(_alike(body, placement, other) for other in same):
+            same.append(placement)
+
     for start in starts[:MOST_TRIED]:
         if (grown := _grown(scene, start)) is not None:
-            kept, seen, placement = grown
-            same = found.setdefault((kept, seen), [])
-            if all(
-                np.linalg.norm(placement.predict(body.position_mm)[0] - p.predict(body.position_mm)[0], axis=1).max() > 1.0 for p in same
-            ):
-                same.append(placement)
+            add(*grown)
+    grown_ones = [(_log_odds(scene, *key, one), key, one) for key, placements in found.items() for one in placements]
+    best = max((odds for odds, _, _ in grown_ones), default=0.0)
+    for _, key, placement in (one for one in grown_ones if one[0] > best + NEGLIGIBLE):
+        for other in _neighbours(scene, *key, placement):
+            if fit := _fitted(scene, *other, placement):
+                add(*other, fit)
     every = [(_log_odds(scene, *key, placement), key, placement) for key, placements in found.items() for placement in placements]
     every = sorted((one for one in every if one[0] > NEGLIGIBLE), key=lambda one: (-one[0], one[1]))
     if not every:
         return Sighting((), (), None, False)
-    odds, (pairs, sights), placement = every[0]
-    total = float(logsumexp([0.0, *(one[0] for one in every)]))
+    total = float(logsumexp([np.log(1 / present - 1), *(one[0] for one in every)]))
+    _, (pairs, sights), placement = every[0]
+    same = [(odds, {*key[0]}, {*key[1]}) for odds, key, other in every if _alike(body, placement, other)]
+
+    def chance(some_pairs: Pairs, some_sights: Pairs) -> float:
+        holding = [odds for odds, one, two in same if one.issuperset(some_pairs) and two.issuperset(some_sights)]
+        return float(np.exp(logsumexp(holding) - total)) if holding else 0.0
+
+    doubts = sorted([(chance((pair,), ()), pair, 0) for pair in pairs] + [(chance((), (sight,)), sight, 1) for sight in sights])
+    while doubts and chance(pairs, sights) < posterior:  # the least sure have no name
+        _, doubted, kind = doubts.pop(0)
+        pairs = tuple(pair for pair in pairs if kind or pair != doubted)
+        sights = tuple(sight for sight in sights if not kind or sight != doubted)
+    markers = {i for i, _ in (*pairs, *sights)}
     untried = starts[MOST_TRIED].met if len(starts) > MOST_TRIED else 0  # as many markers might be met there
-    decisive = np.exp(odds - total) >= posterior and untried < len({i for i, _ in (*pairs, *sights)})
-    return Sighting(pairs, sights, placement, bool(decisive))
+    decisive = len(markers) >= LEAST_POINTS and chance(pairs, sights) >= posterior and untried < len(markers)
+    if decisive and (pairs, sights) != every[0][1]:
+        fitted = _fitted(scene, pairs, sights, placement)
+        decisive, placement = fitted is not None, fitted or placement
+    return Sighting(pairs, sights, placement, decisive)
 
 
-def _log_odds(scene: _Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> float:
+def _alike(body: Cloud, one: Placement, other: Placement) -> bool:
+    """Tell whether two poses are the same within their errors, or nearly."""
+    (mine, by_mine), (theirs, by_theirs) = one.predict(body.position_mm), other.predict(body.position_mm)
+    away = mine - theirs
+    squares = np.einsum("ni,nij,nj->n", away, np.linalg.inv(by_mine + by_theirs + TOLERANCE_MM**2 * np.eye(3)), away)
+    return bool((np.linalg.norm(away, axis=1) < SAME_MM).all() or (squares < GATE**2).all())
+
+
+def _log_odds(scene: Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> float:
     n, found = len(scene.body), len({i for i, _ in (*pairs, *sights)})
     worth = len(pairs) * scene.worth[0] + len(sights) * scene.worth[1] - float(np.log(8 * np.pi**2 * scene.volume))
     return placement.log_likelihood + worth + found * float(np.log(FOUND)) + (n - found) * float(np.log(1 - FOUND))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Start:
-    """A first pose, what it rests on, and how many markers it brings near a point or a ray."""
-
-    rotation: Float
-    translation: Float
-    pairs: Pairs
-    sights: Pairs
-    met: int
-
-
-def _starts(scene: _Scene) -> Iterator[_Start]:
-    body, places = scene.body, scene.points.position_mm
-    length = distances(body)[0]
-    for i, j in permutations(range(len(body)), 2):
-        for a, base in enumerate(places):
-            ends: list[tuple[Float, Pairs, Pairs]] = []
-            for b, end in enumerate(places if i < j else ()):
-                spread = scene.points.covariance_mm2[a] + scene.points.covariance_mm2[b]
-                sd = np.sqrt(GATE_SCALE**2 * np.linalg.eigvalsh(spread)[-1] + 2 * TOLERANCE_MM**2)
-                if a != b and abs(float(np.linalg.norm(end - base)) - length[i, j]) < GATE * sd:
-                    ends.append((end, ((i, a), (j, b)), ()))
-            for r in range(len(scene.rays)):
-                ends += [(end, ((i, a),), ((j, r),)) for end in _pierced(scene, base, float(length[i, j]), r)]
-            for end, pairs, sights in ends:
-                yield from _turned(scene, (i, j), (base, end), pairs, sights)
+def _neighbours(scene: Scene, pairs: Pairs, sights: Pairs, placement: Placement) -> Iterator[tuple[Pairs, Pairs]]:
+    """Yield assignments in which one marker is left out, or has another point or ray of the same focus that it meets as well."""
+    away = nearness(scene.body, scene.points, placement) if len(scene.points) else np.zeros((len(scene.body), 0))
+    off, _ = off_rays(scene.body, scene.rays, placement)
+    for pair in pairs:
+        rest = tuple(other for other in pairs if other != pair)
+        yield rest, sights
+        for a in np.flatnonzero(away[pair[0]] < GATE).tolist():
+            if a not in {b for _, b in pairs}:
+                yield tuple(sorted([*rest, (pair[0], a)])), sights
+    for sight in sights:
+        rest = tuple(other for other in sights if other != sight)
+        yield pairs, rest
+        for r in np.flatnonzero((off[sight[0]] < GATE) & (scene.rays.focus == scene.rays.focus[sight[1]])).tolist():
+            if r not in {x for _, x in sights}:
+                yield pairs, tuple(sorted([*rest, (sight[0], r)]))
 
 
-def _pierced(scene: _Scene, base: Float, radius: float, r: int) -> list[Float]:
-    """Return where a ray meets a sphere, or comes next to it if it just misses."""
-    through, direction = scene.rays.through_mm[r], scene.rays.direction[r]
-    along = float((base - through) @ direction)
-    foot = through + along * direction
-    square = radius**2 - float(((foot - base) ** 2).sum())
-    if square < -2 * radius * GRAZING_MM:
-        return []
-    half = float(np.sqrt(max(square, 0.0)))
-    return [foot + half * direction, foot - half * direction] if half > 0 else [foot]
+def _fitted(scene: Scene, pairs: Pairs, sights: Pairs, near: Placement) -> Placement | None:
+    if len({i for i, _ in (*pairs, *sights)}) < LEAST_POINTS:
+        return None
+    return place_with_rays(scene.body, scene.points, pairs, scene.rays, sights, near.rotation, near.translation)
 
 
-def _turned(scene: _Scene, ends: tuple[int, int], places: tuple[Float, Float], pairs: Pairs, sights: Pairs) -> Iterator[_Start]:
-    """Turn the body about the line through two places; yield the poses at which another marker passes a ray."""
-    (i, j), (base, end), body = ends, places, scene.body.position_mm
-    line = end - base
-    first, axis = _aligning(body[j] - body[i], line), line / np.linalg.norm(line)
-    turns = np.stack([rotation_by(axis * angle) @ first for angle in np.arange(TURNS) * 2 * np.pi / TURNS])
-    moved = np.einsum("tij,nj->tni", turns, body - body[i]) + base  # (t, n, 3)
-    off = np.linalg.norm(np.cross(moved[:, :, None] - scene.rays.through_mm, scene.rays.direction), axis=-1)  # (t, n, r)
-    away = np.linalg.norm(moved[:, :, None] - scene.points.position_mm, axis=-1)
-    met = ((off < COARSE_MM).any(axis=2) | (away < COARSE_MM).any(axis=2)).sum(axis=1)
-    least = (off < COARSE_MM) & (off <= np.roll(off, 1, axis=0)) & (off < np.roll(off, -1, axis=0))
-    for t, marker, ray in np.argwhere(least).tolist():
-        if marker not in ends and ray not in {r for _, r in sights}:
-            seen = tuple(sorted([*sights, (marker, ray)]))
-            yield _Start(turns[t], base - turns[t] @ body[i], pairs, seen, int(met[t]))
-
-
-def _aligning(source: Float, target: Float) -> Float:
-    """Return a rotation that turns one direction into another."""
-    a, b = source / np.linalg.norm(source), target / np.linalg.norm(target)
-    axis = np.cross(a, b)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-9:
-        other = np.cross(a, [1.0, 0, 0] if abs(a[0]) < 0.9 else [0, 1.0, 0])
-        return np.eye(3) if a @ b > 0 else rotation_by(np.pi * other / np.linalg.norm(other))
-    return rotation_by(axis / sine * np.arctan2(sine, a @ b))
-
-
-def _grown(scene: _Scene, start: _Start) -> tuple[Pairs, Pairs, Placement] | None:
+def _grown(scene: Scene, start: Start) -> tuple[Pairs, Pairs, Placement] | None:
     """Fit a first pose, and take in what it meets until nothing changes."""
     body, points, rays = scene.body, scene.points, scene.rays
     pairs, sights, rotation, translation = start.pairs, start.sights, start.rotation, start.translation
@@ -261,7 +242,7 @@ def _grown(scene: _Scene, start: _Start) -> tuple[Pairs, Pairs, Placement] | Non
     return (pairs, sights, placement) if placement is not None and (pairs, sights) == _met(scene, placement) else None
 
 
-def _met(scene: _Scene, placement: Placement) -> tuple[Pairs, Pairs]:
+def _met(scene: Scene, placement: Placement) -> tuple[Pairs, Pairs]:
     """Return the points and rays that markers meet at a pose: the nearest in units of sd first, points before rays."""
     pairs: dict[int, int] = {}
     sights: dict[tuple[int, int], int] = {}

@@ -49,7 +49,7 @@ def pack(groups: Sequence[tuple[int, ...]], gain: Float) -> Packing:
     Packing
     """
     chosen, posterior = np.zeros(len(groups), bool), np.full(len(groups), np.nan)
-    for members in _components(groups):
+    for members in components(groups):
         try:
             _solve(groups, gain, members, chosen, posterior)
         except _TooLargeError:
@@ -70,7 +70,8 @@ def pack(groups: Sequence[tuple[int, ...]], gain: Float) -> Packing:
     return Packing(chosen, posterior)
 
 
-def _components(groups: Sequence[tuple[int, ...]]) -> list[list[int]]:
+def components(groups: Sequence[tuple[int, ...]]) -> list[list[int]]:
+    """Return the groups that are linked by common images, each part for itself."""
     parent: dict[int, int] = {}
 
     def root(i: int) -> int:

@@ -7,7 +7,7 @@ the pairs that are beyond doubt. All assignments are summed (:mod:`packing`): a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Final
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.crossings import Crossings, Region, common_error, find_crossings
-from rsa_vision.identify.packing import Packing, pack
+from rsa_vision.identify.packing import Packing, components, pack
 from rsa_vision.identify.pair_looks import Looks, images_alone, log_odds_of_looks
 from rsa_vision.settings import Limits
 from rsa_vision.types import Bool, Float, Int
@@ -23,6 +23,7 @@ from rsa_vision.types import Bool, Float, Int
 ROUNDS: Final = 5
 PRIOR: Final = (0.02, 0.95)  # bounds of the learnt fraction of rays that have a partner
 MOST_GROUPS: Final = 20_000
+MOST_CONTESTED: Final = 100  # groups that are left to the markers' configuration to choose among
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +48,11 @@ class Pairing:
         Error of the rays beyond their covariance that the crossings show (in quadrature to the sigma of a crossing); 0: none.
     reasons : tuple of str
         ``pair-ambiguous`` or nothing.
+    contested : tuple of tuple of int
+        Every possible group of the images that ambiguous groups claim, and of those linked with them by other possible groups; none if
+        there are more than can be weighed.
+    contested_log_odds : ndarray of shape (c,)
+        Of such a group, against its images being unrelated.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -57,6 +63,8 @@ class Pairing:
     unmatched: Int
     slack_mm: float
     reasons: tuple[str, ...]
+    contested: tuple[tuple[int, ...], ...] = ()
+    contested_log_odds: Float = field(default_factory=lambda: np.zeros(0))
 
 
 def pair_rays(
@@ -105,7 +113,7 @@ def pair_rays(
     claims = [tuple(sorted(set(bundle.image[list(group)].tolist()))) for group in groups]
     look, of_quality = np.zeros(len(crossings)), np.zeros(len(bundle))
     prior = 0.5
-    packing = Packing(np.zeros(0, bool), np.zeros(0))
+    packing, gain = Packing(np.zeros(0, bool), np.zeros(0)), np.zeros(len(groups))
     for _ in range(ROUNDS):  # what pairs look like, and how many there are, from the pairs themselves
         gain = share @ crossings.log_ratio() + membership @ look + np.log(prior / (1 - prior)) * (np.array([len(g) for g in groups]) - 1)
         gain += np.array([of_quality[list(g)].sum() for g in groups])
@@ -121,7 +129,15 @@ def pair_rays(
         alone = images_alone(looks, of_ray)
         crossings = crossings.among(neighbours, (1 - of_ray) + alone.hidden * of_ray)
         look, of_quality = log_odds_of_looks(looks, of_crossing, alone, images_alone(looks.sizes, of_ray)), alone.log_quality
-    return _pairing(bundle, crossings, groups, membership, packing, images, limits, slack)
+    found = _pairing(bundle, crossings, groups, membership, packing, images, limits, slack)
+    contested = _contested(claims, {claims[groups.index(g)] for g, doubt in zip(found.groups, found.ambiguous, strict=True) if doubt})
+    return replace(found, contested=tuple(groups[g] for g in contested), contested_log_odds=gain[contested])
+
+
+def _contested(claims: list[tuple[int, ...]], ambiguous: set[tuple[int, ...]]) -> list[int]:
+    """Return the groups that share images with ambiguous ones, directly or by others."""
+    linked = [g for part in components(claims) if any(claims[g] in ambiguous for g in part) for g in part]
+    return linked if len(linked) <= MOST_CONTESTED else []
 
 
 def _looks(bundle: RayBundle, crossings: Crossings, radius_mm: Float | None, contrast: Float | None, quality: Int | None) -> Looks:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rsa_vision
 from rsa_vision.cli import run_app
@@ -16,10 +18,12 @@ from rsa_vision.errors import SettingsError
 from rsa_vision.followup import follow_up
 from rsa_vision.segments import Segment, read_segments
 from rsa_vision.settings import Limits
+from rsa_vision.sightlines import Sightlines
 from rsa_vision.tables import SCHEMAS
 from rsa_vision.types import MarkerImages
 from synthetic.study import make_study
 from tests.cli.conftest import SD_PX, content
+from tests.identify.bodies import seen_from
 
 TEXT = {"subject": pl.String, "exam": pl.String, "segment": pl.String, "marker": pl.String, "flags": pl.String, "number": pl.String}
 FIRST, SECOND, THIRD = "202601010900", "202601020900", "202601030900"
@@ -81,7 +85,7 @@ def hide(films: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def places(table: pl.DataFrame, exam: str) -> dict[str, np.ndarray]:
-    rows = table.filter(pl.col("exam") == exam).to_dicts()
+    rows = table.filter((pl.col("exam") == exam) & pl.col("x_mm").is_not_null()).to_dicts()
     return {f"{r['segment'] or ''}/{r['marker']}".lstrip("/"): np.array([r["x_mm"], r["y_mm"], r["z_mm"]]) for r in rows}
 
 
@@ -139,6 +143,9 @@ def test_names_without_segments_stay_those_of_the_first_examination(films: Path,
     for given in names.values():
         assert all(meaning[name] == true for name, true in given.items())
     assert len(names[THIRD]) == 11
+    (lost,) = read(tmp_path / "markers.csv").filter(pl.col("x_mm").is_null()).to_dicts()  # what nothing shows has a row that says so
+    (implant_1,) = (name for name, true in names[FIRST].items() if true == "implant/1")
+    assert (lost["exam"], lost["marker"], lost["flags"], lost["n_views"]) == (SECOND, implant_1, "missing", 0)
     assert exams(tmp_path)[FIRST] == ("ok", "")
     assert exams(tmp_path)[SECOND][0] == "review"  # a marker that the first did not show
     assert exams(tmp_path)[THIRD] == ("ok", "")  # by now it is known
@@ -199,8 +206,12 @@ def test_names_given_twice_are_the_same_and_too_few_markers_are_never_named() ->
         assert first["exams"][0]["status"] == last["exams"][0]["status"] == "ok"
         assert [row["marker"] for row in last["markers"]] == [row["marker"] for row in first["markers"]][::-1]
         assert few["exams"][0]["status"] == "review"
-        assert not {row["marker"] for row in few["markers"]} & {row["marker"] for row in first["markers"]}
-        assert none["markers"] == []
+        every = {row["marker"] for row in first["markers"]}
+        assert not {row["marker"] for row in few["markers"] if row["x_mm"] is not None} & every
+        for exam in (few, none):
+            missing = [row for row in exam["markers"] if row["x_mm"] is None]
+            assert {row["marker"] for row in missing} == every
+            assert all(row["flags"] == "missing" and row["n_views"] == 0 for row in missing)
 
 
 def test_doubtful_pairs_that_agree_with_the_segment_stay_in_review_and_it_says_so() -> None:
@@ -220,6 +231,21 @@ def test_reconstruct_names_points_by_segments(films: Path, tmp_path: Path) -> No
     for names in names_of_truth(films, tmp_path / "out").values():
         assert len(names) == 11
         assert all(given == true for given, true in names.items())
+
+
+def test_reconstruct_predicts_markers_that_are_named_at_one_focus_only(films: Path, tmp_path: Path) -> None:
+    points = read(films / "truth" / "images.csv").filter((pl.col("role") != "unassigned") & (pl.col("exam") == SECOND))
+    points = points.filter((pl.col("number") != "bone/3") | (pl.col("focus") == 1))
+    objects = {name: str(101 + k) for k, name in enumerate(sorted(points.filter(pl.col("role") == "object")["number"].unique()))}
+    points.with_columns(pl.col("number").replace(objects)).write_csv(tmp_path / "points.csv")
+    rsa_vision.reconstruct(tmp_path / "points.csv", tmp_path / "out", cage="2", segments=films / "truth" / "segments.csv")
+    markers = read(tmp_path / "out" / "markers.csv")
+    assert len(markers) == 11
+    (row,) = markers.filter(pl.col("flags").str.contains("predicted")).to_dicts()
+    assert (row["segment"], row["marker"], row["flags"]) == ("bone", "3", "one-view;predicted")
+    error = places(markers, SECOND)["bone/3"] - places(read(films / "truth" / "markers.csv"), SECOND)["bone/3"]
+    assert (np.abs(error) < [3 * row[f"sd_{axis}_mm"] for axis in "xyz"]).all()
+    assert exams(tmp_path / "out")[SECOND] == ("review", "marker-one-view")
 
 
 HEAD = "subject,segment,marker,x_mm,y_mm,z_mm\n"
@@ -250,3 +276,28 @@ def test_segments_that_cannot_be_used_are_refused_with_every_error(text: str, sa
 def test_proposals_need_two_examinations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(["segments", "propose", str(tmp_path)]) == 2
     assert "no results" in capsys.readouterr().err
+
+
+def test_a_marker_hidden_without_segments_has_no_place_where_bodies_moved(films: Path, hide: Any, tmp_path: Path) -> None:
+    hide((SECOND, 2, "bone/3"))
+    assert run_app(["measure", str(films), "-o", str(tmp_path)]) == 1
+    (lost,) = read(tmp_path / "markers.csv").filter(pl.col("x_mm").is_null()).to_dicts()  # nothing tells with which body it moved
+    assert (lost["exam"], lost["flags"]) == (SECOND, "missing")
+
+
+def test_a_marker_hidden_without_segments_is_predicted_where_nothing_moved() -> None:
+    rng = np.random.default_rng(3)
+    body, turn = rng.normal([0, 100, 150], 20, (6, 3)), Rotation.from_rotvec([0.1, -0.2, 0.1])
+    moved = turn.apply(body) + np.array([3, -2, 1])
+    first, second = rows_of("1", body), rows_of("2", moved[:5])
+    ray = seen_from(rng, moved[5:], np.array([0]), 0.01)
+    image = dict.fromkeys(SCHEMAS["images"]) | {"focus": 1, "role": "unassigned", "number": "", "shape": "ball", "flags": ""}
+    for shift, names in ((0.0, {"P01", "P02", "P03", "P04", "P05", "P06"}), (1.0, {"P01", "P02", "P03", "P04", "P05"})):
+        shifted = replace(ray, through_mm=ray.through_mm + np.array([shift, 0, 0]))
+        seen = {**second, "images": [image], **Sightlines(shifted, (), np.zeros(0)).rows()}
+        _, named = follow_up([first, seen], None, Limits())
+        assert {row["marker"] for row in named["markers"] if row["x_mm"] is not None} == names
+        (row,) = (row for row in named["markers"] if row["marker"] == "P06")
+        assert row["flags"] == ("missing" if shift else "one-view;predicted")
+        assert named["exams"][0]["status"] == ("ok" if shift else "review")
+        assert shift or np.abs(np.array([row["x_mm"], row["y_mm"], row["z_mm"]]) - moved[5]).max() < 0.3

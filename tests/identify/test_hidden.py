@@ -78,3 +78,38 @@ def test_a_symmetric_body_has_more_than_one_pose() -> None:
     )
     assert found.placement is not None
     assert not found.decisive
+
+
+def test_a_segment_without_any_point_is_found_by_rays_of_one_focus_with_true_errors() -> None:
+    rng = np.random.default_rng(5)
+    decisive, squares = 0, []
+    for _ in range(3):
+        body, places, points, _, _, seen = scene(rng, 6, 0, 6, 2)
+        one = seen_from(rng, np.concatenate([places[seen[:6]], places[:2] + rng.normal(0, 15, (2, 3))]), np.zeros(8, int))
+        found = find_with_rays(Cloud.exact(body), points, one, 1e5, POSTERIOR, around_mm=places + rng.normal(0, 20, places.shape))
+        mirrored = find_with_rays(Cloud.exact(body * [-1, 1, 1]), points, one, 1e5, POSTERIOR, around_mm=places)
+        assert not mirrored.decisive
+        if found.decisive:
+            decisive += 1
+            assert all(seen[r] == i for i, r in found.sights)
+            at, covariance = found.placement.predict(body)
+            error = at - places
+            stated = covariance + TOLERANCE_MM**2 * np.eye(3)
+            squares += np.einsum("ni,nij,nj->n", error, np.linalg.inv(stated), error).tolist()
+    assert decisive >= 2
+    assert 0.2 < np.mean(squares) / 3 < 3  # the errors of one pose are common to its markers
+    assert max(squares) < 25
+
+
+def test_an_image_beside_a_hidden_marker_takes_its_name_from_neither_or_the_right_one() -> None:
+    rng = np.random.default_rng(6)
+    named = 0
+    for _ in range(3):
+        body, places, points, _, _, seen = scene(rng, 6, 2, 4, 0)
+        beside = places[seen[:1]] + np.array([0.25, 0.1, 0])
+        rays = seen_from(rng, np.concatenate([places[seen], beside]), np.zeros(5, int))
+        found = find_with_rays(Cloud.exact(body), points, rays, 1e5, POSTERIOR)
+        if found.decisive:
+            assert all(r < 4 and seen[r] == i for i, r in found.sights)
+            named += len(found.sights)
+    assert named >= 5

@@ -273,5 +273,5 @@ def test_crossings_tell_of_errors_that_the_cage_does_not_show() -> None:
         assert all(focus.fiducial_birge < 2 for focus in found.foci)
         error = found.markers.position_mm - objects
         ratios.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.markers.covariance_mm2), error) / 3)
-        assert crossing_factor(found.markers) > 1
+        assert crossing_factor(found.markers.crossing_um, found.markers.crossing_sd_um) > 1
     assert 0.8 < np.sqrt(np.mean(ratios)) < 1.3
