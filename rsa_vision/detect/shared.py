@@ -1,0 +1,286 @@
+"""The last fit of a film's pins or tees: all at once, with what they have in common estimated beside what is each one's own.
+
+Errors of attenuation, blur and the directions of parallel arms move every tip the same way and do not average out over a cage. Estimated
+from one needle these are poor, from all of them they are good. Each needle's own parameters are eliminated from the normal equations
+(variable projection; Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973), so that the work goes with the number of needles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from rsa_vision.detect.balls import polynomial
+from rsa_vision.detect.crossing import between, gain_at, lapping, scored
+from rsa_vision.detect.needle_sets import clusters, others_beside
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, core_pixels, support
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.patches import columns, cut, weighted_least_squares
+from rsa_vision.detect.profiles import Optics
+from rsa_vision.types import Float
+
+_STEPS = 8
+_CONVERGED_PX = 1e-3
+_STEP = 0.05  # of the logarithms of attenuation and blur, for derivatives
+_ATTENUATION_ERROR, _BLUR_ERROR, _ROUGH_BLUR = 0.7, 0.15, 0.3  # of the logarithms, before the needles are asked; rough: no ball told it
+_DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
+_MOST_BY_STEP = 0.3  # of all these
+_SLANT, _SKEW = 0.2, 0.1  # expected sizes: rays cross a film at slopes of up to a half
+_MOST_SLANT, _MOST_SKEW = 0.6, 0.3
+# slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
+_OF_SLANTS = {
+    1: np.eye(2),
+    3: np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0, 0, -1]]),
+}
+_RIDGE = 1e-4  # relative: keeps what the pixels do not determine where it is
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    """Pixels of needles that are fitted together; ``beside``: images of the others there."""
+
+    cols: Float
+    rows: Float
+    data: Float
+    beside: Float
+    surface: Float
+    corner_px: Float
+    size: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """Linearised fit of the needles of a window; rows weighted to a variance of one, those of priors last.
+
+    ``basis``, ``triangle``: of the columns of the own parameters, in units of ``scale``; ``common``: what of the columns of the common
+    ones the own ones cannot stand for.
+    """
+
+    members: list[NeedleFit]
+    images: list[Float]
+    weight: Float
+    left: Float
+    ground: Float
+    background: float
+    residual: Float
+    basis: Float
+    triangle: Float
+    scale: Float
+    by_common: Float
+    common: Float
+
+    def own(self, target: Float) -> Float:
+        """Own parameters that explain a target (n,) or (n, m), shape (p,) or (p, m)."""
+        return np.asarray((solve_triangular(self.triangle, self.basis.T @ target).T / self.scale).T)
+
+    @property
+    def excess(self) -> float:
+        """Chi2 under the arms over what noise leaves, at least one."""
+        return max(1.0, float(np.mean((self.weight * self.left**2)[np.abs(np.sum(self.images, axis=0)) > 0])))
+
+
+def fit_shared(
+    film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, parallel: bool
+) -> tuple[list[NeedleFit], Optics]:
+    """Fit all needles of a film and their common attenuation, blur and directions.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    needles : list of NeedleFit
+        Starts, all pins or all tees.
+    optics : Optics
+        Start.
+    noise : NoiseModel
+    parallel : bool
+        The arms of all needles have the same directions against their first; else each arm its own.
+
+    Returns
+    -------
+    needles : list of NeedleFit
+        In another order. The covariance of a tip holds the errors of what is common.
+    optics : Optics
+    """
+    if not needles:
+        return [], optics
+    parallel = parallel and len(needles[0].angles) > 1
+    sets = clusters(needles)
+    windows = [_window(film, members, needles, optics, noise) for members in sets]
+    slopes = [_by_optics(w, members, optics) for w, members in zip(windows, sets, strict=True)]
+    before = [_ATTENUATION_ERROR, _ROUGH_BLUR if optics.rough else _BLUR_ERROR]
+    precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
+    moved = np.zeros(len(precision))
+    start = optics
+    converged = False
+    for step in range(_STEPS + 1):
+        systems = [_linearise(w, m, k, optics, noise, parallel) for w, m, k in zip(windows, sets, slopes, strict=True)]
+        normal = precision + sum(e.common.T @ e.common / e.excess for e in systems)
+        if step == _STEPS or converged:
+            break
+        change = np.linalg.solve(normal, sum(e.common.T @ e.residual / e.excess for e in systems) - precision @ moved)
+        change *= min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9))
+        moved += change
+        optics = replace(start, mu_px=start.mu_px * float(np.exp(moved[0])), sigma_px=start.sigma_px * float(np.exp(moved[1])))
+        furthest = 0.0
+        for i, e in enumerate(systems):
+            delta = e.own(e.residual - e.by_common @ change)
+            sets[i], far = _moved(e.members, delta, change[2:], parallel)
+            furthest = max(furthest, far)
+        converged = step > 0 and furthest < _CONVERGED_PX
+    errors = _common_errors(windows, systems, normal, precision, noise)
+    out = []
+    for window, e in zip(windows, systems, strict=True):
+        out += _finished(window, e, errors, optics, noise, converged)
+    return out, optics
+
+
+def _window(film: NDArray[Any], members: list[NeedleFit], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> _Window:
+    middle = np.mean([f.position_px for f in members], axis=0)
+    spread = max(float(np.abs(f.position_px - middle).max()) for f in members)
+    half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in members) + 3 * optics.sigma_px + 3))
+    patch = cut(film, middle[None], half, noise)
+    corner = patch.corner_px[0].astype(np.float64)
+    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
+    cols, rows = cols + corner[0], rows + corner[1]
+    near = np.zeros(cols.shape, bool)
+    for f in members:
+        near |= support(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, 3 * optics.sigma_px + 4.0)
+    near &= patch.valid[0]
+    cols, rows, raw = cols[near], rows[near], patch.values[0][near]
+    others = others_beside(members, [t for t in needles if all(t is not m for m in members)], optics)
+    beside = others(cols, rows) if others else np.zeros_like(raw)
+    return _Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]), corner, patch.size)
+
+
+def _arms(window: _Window, fit: NeedleFit, optics: Optics) -> Float:
+    slants = np.zeros((2, len(fit.angles))) if fit.slants is None else fit.slants
+    return arm_images(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit.angles, fit.shape, optics, slants)
+
+
+def _by_optics(window: _Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
+    """Derivatives of each member's arms by the logarithms of attenuation and blur, shape (2, k, n); they hardly change on the way."""
+    factor = np.exp(_STEP)
+    trials = replace(optics, mu_px=optics.mu_px * factor), replace(optics, sigma_px=optics.sigma_px * factor)
+    return [np.array([(_arms(window, f, o)[0] - _arms(window, f, optics)[0]) / _STEP for o in trials]) for f in members]
+
+
+def _linearise(
+    window: _Window, members: list[NeedleFit], slopes: list[Float], optics: Optics, noise: NoiseModel, parallel: bool
+) -> _Equations:
+    blocks = [_arms(window, f, optics) for f in members]
+    # a first background for the gain; the next round has a better one
+    linear = columns([*(b[0] for b in blocks), *lapping([b[0].sum(0) for b in blocks]), window.surface.T])
+    level = np.full(len(window.data), float(window.data.mean()))
+    weight = 1.0 / noise.variance_at(level + window.beside)
+    for _ in range(2):
+        theta = weighted_least_squares(linear, weight, window.data, 1e-6)
+        weight = 1.0 / noise.variance_at(linear @ theta + window.beside)
+    ground = window.surface[:, 1:] @ theta[-window.surface.shape[1] + 1 :]
+    if optics.proportion:
+        gains = [gain_at(f, ground, optics) for f in members]
+        blocks = [b * g for b, g in zip(blocks, gains, strict=True)]
+        slopes = [s * g for s, g in zip(slopes, gains, strict=True)]
+        linear = columns([*(b[0] for b in blocks), *lapping([b[0].sum(0) for b in blocks]), window.surface.T])
+        theta = weighted_least_squares(linear, weight, window.data, 1e-6)
+    arms = len(members[0].angles)
+    now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
+    moves, common, priors, known = [], np.zeros((2 + (arms - 1) * parallel, len(weight))), [], []
+    for f, (_, d_col, d_row, d_w, d_l, d_angle, d_slant, d_skew), slope in zip(now, blocks, slopes, strict=True):
+        turns = f.depths[:, None] * d_angle
+        slants = np.zeros((2, arms)) if f.slants is None else f.slants
+        moves += [(f.depths @ d)[None] for d in (d_col, d_row, d_w, d_l)]
+        moves += [
+            turns.sum(0, keepdims=True) if parallel else turns,
+            _OF_SLANTS[arms].T @ (f.depths[:, None] * np.array([d_slant, d_skew])).reshape(2 * arms, -1),
+        ]
+        common[:2] += f.depths @ slope
+        if parallel:
+            common[2:] += turns[1:]
+        ours = slants.ravel() @ _OF_SLANTS[arms] / (_OF_SLANTS[arms] ** 2).sum(0)
+        expected = np.array([_SLANT] * ((arms + 1) // 2) + [_SKEW])
+        priors += [np.zeros(4 + (1 if parallel else arms)), 1 / expected]
+        known += [np.zeros(4 + (1 if parallel else arms)), -ours / expected]
+    root = np.sqrt(weight)
+    jac = np.concatenate([*moves, linear.T]).T * root[:, None]
+    scale = np.maximum(np.linalg.norm(jac, axis=0), 1e-12)
+    prior = np.concatenate([*priors, np.zeros(linear.shape[1])]) / scale
+    basis, triangle = np.linalg.qr(np.concatenate([jac / scale, np.diag(np.hypot(prior, _RIDGE))]))
+    by_common = np.concatenate([common.T * root[:, None], np.zeros((len(scale), len(common)))])
+    left = window.data - linear @ theta
+    residual = np.concatenate([left * root, *known, np.zeros(linear.shape[1])])
+    images = [f.depths @ b[0] for f, b in zip(now, blocks, strict=True)]
+    return _Equations(
+        now,
+        images,
+        weight,
+        left,
+        ground,
+        float(theta[-window.surface.shape[1]]),
+        residual,
+        basis,
+        triangle,
+        scale,
+        by_common,
+        by_common - basis @ (basis.T @ by_common),
+    )
+
+
+def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, parallel: bool) -> tuple[list[NeedleFit], float]:
+    """Needles after a step of their own parameters and of the common directions, and how far the furthest tip went."""
+    arms = len(members[0].angles)
+    turning = 1 if parallel else arms
+    each = 4 + turning + _OF_SLANTS[arms].shape[1]
+    parts = delta[: each * len(members)].reshape(len(members), each)
+    shift, turn = float(np.abs(parts[:, :2]).max()), float(np.abs(parts[:, 4 : 4 + turning]).max())
+    scale = min(1.0, 1.0 / max(shift, 1e-9), 0.1 / max(turn, 1e-9))
+    out = []
+    for f, part in zip(members, scale * parts, strict=True):
+        width = between(f.shape.half_width_px + between(part[2], -0.5, 0.5), 0.6, 0.3 * f.shape.length_px)
+        shape = NeedleShape(width, max(f.shape.length_px + between(part[3], -2.0, 2.0), 3.0), f.shape.taper)
+        angles = f.angles + part[4 : 4 + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
+        slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (_OF_SLANTS[arms] @ part[4 + turning :]).reshape(2, arms)
+        slants = np.clip(slants, [[-_SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
+        out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants))
+    return out, shift
+
+
+def _patch(window: _Window, rows: Float) -> Float:
+    """Put values at the pixels of a window, shape (p, n), into its square."""
+    out = np.zeros((len(rows), window.size, window.size))
+    at = (window.rows - window.corner_px[1]).astype(np.intp), (window.cols - window.corner_px[0]).astype(np.intp)
+    out[:, *at] = rows
+    return out
+
+
+def _common_errors(windows: list[_Window], systems: list[_Equations], normal: Float, precision: Float, noise: NoiseModel) -> Float:
+    """Covariance of the common parameters, for noise that neighbouring pixels share."""
+    spread = precision.copy()
+    for window, e in zip(windows, systems, strict=True):
+        spread += influence_covariance(_patch(window, e.common[: len(e.weight)].T), noise.correlation) / e.excess
+    inverse = np.linalg.inv(normal)
+    covariance: Float = inverse @ spread @ inverse
+    return covariance
+
+
+def _finished(window: _Window, e: _Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
+    arms = len(e.members[0].angles)
+    turning = 1 if e.by_common.shape[1] > 2 else arms
+    step = 4 + turning + _OF_SLANTS[arms].shape[1]
+    tips = [step * i + axis for i in range(len(e.members)) for axis in range(2)]
+    to_own = (solve_triangular(e.triangle, e.basis.T).T / e.scale).T[tips]
+    influence = influence_covariance(_patch(window, to_own[:, : len(e.weight)]), noise.correlation)
+    by_common = to_own @ e.by_common
+    covariance = influence + by_common @ errors @ by_common.T
+    variance = float(noise.variance_at(np.array([e.background]))[0])
+    out = []
+    for i, (fit, image) in enumerate(zip(e.members, e.images, strict=True)):
+        at = slice(2 * i, 2 * i + 2)
+        fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
+        whole = core_pixels(fit.position_px, fit.angles, fit.shape, optics.sigma_px)
+        out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance, whole))
+    return out
