@@ -113,7 +113,7 @@ def _opacity(
         p = np.concatenate([-p[:0:-1], p])  # else one half; the other is its mirror image
     fine_s = (s[:, None] + CELL * (np.arange(2) - 0.5) / 2).reshape(-1, 1)
     fine_p = (p[:, None] + CELL * (np.arange(2) - 0.5) / 2).ravel()
-    width = np.minimum(half_width * np.clip(fine_s / (taper * length), 0.0, None), half_width * (1.0 if taper < 1 else np.inf))
+    width = half_width * np.clip(fine_s / (taper * length), 0.0, 1.0)
     chord = 2 * np.sqrt(np.maximum(width**2 - fine_p**2, 0.0))
     before = length - fine_s - skew * fine_p
     if slant:
@@ -197,7 +197,7 @@ def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: 
     # tables stand on a grid of shapes, shared by all needles of a film; in between the image is linear in the shape
     off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % GRID_L
     film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
-    key = round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4), shape.taper, *film
+    key = round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4), round(shape.taper, 3), *film
     c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
     along, across = dx * c + dy * s, dy * c - dx * s
     ends: list[Float] = []

@@ -26,8 +26,10 @@ from rsa_vision.types import Float
 
 _STEPS = 8
 _CONVERGED_PX = 1e-3
-_STEP = 0.05  # of the logarithms of attenuation and blur, for derivatives
+_STEP = 0.05  # of the logarithms of attenuation and blur, and of the taper, for derivatives
 _ATTENUATION_ERROR, _BLUR_ERROR, _ROUGH_BLUR = 0.7, 0.15, 0.3  # of the logarithms, before the needles are asked; rough: no ball told it
+_TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
+_SHARED = 3  # attenuation, blur, taper
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _MOST_BY_STEP = 0.3  # of all these
 _SLANT, _SKEW = 0.2, 0.1  # expected sizes: rays cross a film at slopes of up to a half
@@ -112,24 +114,24 @@ def fit_shared(
     sets = clusters(needles)
     windows = [_window(film, members, needles, optics, noise) for members in sets]
     slopes = [_by_optics(w, members, optics) for w, members in zip(windows, sets, strict=True)]
-    before = [_ATTENUATION_ERROR, _ROUGH_BLUR if optics.rough else _BLUR_ERROR]
+    before = [_ATTENUATION_ERROR, _ROUGH_BLUR if optics.rough else _BLUR_ERROR, _TAPER_ERROR]
     precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     moved = np.zeros(len(precision))
-    start = optics
+    start, taper = optics, needles[0].shape.taper
     converged = False
     for step in range(_STEPS + 1):
         systems = [_linearise(w, m, k, optics, noise, parallel) for w, m, k in zip(windows, sets, slopes, strict=True)]
         normal = precision + sum(e.common.T @ e.common / e.excess for e in systems)
         if step == _STEPS or converged:
             break
-        change = np.linalg.solve(normal, sum(e.common.T @ e.residual / e.excess for e in systems) - precision @ moved)
-        change *= min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9))
+        change = _step(normal, sum(e.common.T @ e.residual / e.excess for e in systems) - precision @ moved, taper)
         moved += change
+        taper += change[2]
         optics = replace(start, mu_px=start.mu_px * float(np.exp(moved[0])), sigma_px=start.sigma_px * float(np.exp(moved[1])))
         furthest = 0.0
         for i, e in enumerate(systems):
             delta = e.own(e.residual - e.by_common @ change)
-            sets[i], far = _moved(e.members, delta, change[2:], parallel)
+            sets[i], far = _moved(e.members, delta, change[_SHARED:], taper, parallel)
             furthest = max(furthest, far)
         converged = step > 0 and furthest < _CONVERGED_PX
     errors = _common_errors(windows, systems, normal, precision, noise)
@@ -157,16 +159,35 @@ def _window(film: NDArray[Any], members: list[NeedleFit], needles: list[NeedleFi
     return _Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]), corner, patch.size)
 
 
+def _step(normal: Float, target: Float, taper: float) -> Float:
+    """Change of the common parameters, not too far at once; the taper stays within its bounds, the others follow."""
+    change = np.linalg.solve(normal, target).astype(np.float64)
+    change *= min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9))
+    held = between(change[2], _LEAST_TAPER - taper, 1.0 - taper)
+    if held != change[2]:
+        others = np.arange(len(change)) != 2
+        change[others] = np.linalg.solve(normal[np.ix_(others, others)], target[others] - normal[others, 2] * held)
+        change[others] *= min(1.0, _MOST_BY_STEP / max(float(np.abs(change[others]).max()), 1e-9))
+        change[2] = held
+    return change
+
+
 def _arms(window: _Window, fit: NeedleFit, optics: Optics) -> Float:
     slants = np.zeros((2, len(fit.angles))) if fit.slants is None else fit.slants
     return arm_images(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit.angles, fit.shape, optics, slants)
 
 
 def _by_optics(window: _Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
-    """Derivatives of each member's arms by the logarithms of attenuation and blur, shape (2, k, n); they hardly change on the way."""
+    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n); they hardly change on the way."""
     factor = np.exp(_STEP)
-    trials = replace(optics, mu_px=optics.mu_px * factor), replace(optics, sigma_px=optics.sigma_px * factor)
-    return [np.array([(_arms(window, f, o)[0] - _arms(window, f, optics)[0]) / _STEP for o in trials]) for f in members]
+    denser, wider = replace(optics, mu_px=optics.mu_px * factor), replace(optics, sigma_px=optics.sigma_px * factor)
+    out = []
+    for f in members:
+        shorter = replace(f, shape=replace(f.shape, taper=f.shape.taper - _STEP))
+        here = _arms(window, f, optics)[0]
+        trials = _arms(window, f, denser)[0] - here, _arms(window, f, wider)[0] - here, here - _arms(window, shorter, optics)[0]
+        out.append(np.array(trials) / _STEP)
+    return out
 
 
 def _linearise(
@@ -189,22 +210,21 @@ def _linearise(
         theta = weighted_least_squares(linear, weight, window.data, 1e-6)
     arms = len(members[0].angles)
     now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
-    moves, common, priors, known = [], np.zeros((2 + (arms - 1) * parallel, len(weight))), [], []
+    of_slants = _OF_SLANTS[arms]
+    expected = np.array([*[_SLANT] * (of_slants.shape[1] - 1), _SKEW])
+    moves, common, priors, known = [], np.zeros((_SHARED + (arms - 1) * parallel, len(weight))), [], []
     for f, (_, d_col, d_row, d_w, d_l, d_angle, d_slant, d_skew), slope in zip(now, blocks, slopes, strict=True):
         turns = f.depths[:, None] * d_angle
         slants = np.zeros((2, arms)) if f.slants is None else f.slants
+        by_ends = (f.depths[:, None] * np.array([d_slant, d_skew])).reshape(2 * arms, -1)
         moves += [(f.depths @ d)[None] for d in (d_col, d_row, d_w, d_l)]
-        moves += [
-            turns.sum(0, keepdims=True) if parallel else turns,
-            _OF_SLANTS[arms].T @ (f.depths[:, None] * np.array([d_slant, d_skew])).reshape(2 * arms, -1),
-        ]
-        common[:2] += f.depths @ slope
+        moves += [turns.sum(0, keepdims=True) if parallel else turns, of_slants.T @ by_ends]
+        common[:_SHARED] += f.depths @ slope
         if parallel:
-            common[2:] += turns[1:]
-        ours = slants.ravel() @ _OF_SLANTS[arms] / (_OF_SLANTS[arms] ** 2).sum(0)
-        expected = np.array([_SLANT] * ((arms + 1) // 2) + [_SKEW])
-        priors += [np.zeros(4 + (1 if parallel else arms)), 1 / expected]
-        known += [np.zeros(4 + (1 if parallel else arms)), -ours / expected]
+            common[_SHARED:] += turns[1:]
+        start = np.zeros(4 + (1 if parallel else arms))
+        priors += [start, 1 / expected]
+        known += [start, -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected]
     root = np.sqrt(weight)
     jac = np.concatenate([*moves, linear.T]).T * root[:, None]
     scale = np.maximum(np.linalg.norm(jac, axis=0), 1e-12)
@@ -230,7 +250,7 @@ def _linearise(
     )
 
 
-def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, parallel: bool) -> tuple[list[NeedleFit], float]:
+def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, taper: float, parallel: bool) -> tuple[list[NeedleFit], float]:
     """Needles after a step of their own parameters and of the common directions, and how far the furthest tip went."""
     arms = len(members[0].angles)
     turning = 1 if parallel else arms
@@ -241,7 +261,7 @@ def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, parallel: b
     out = []
     for f, part in zip(members, scale * parts, strict=True):
         width = between(f.shape.half_width_px + between(part[2], -0.5, 0.5), 0.6, 0.3 * f.shape.length_px)
-        shape = NeedleShape(width, max(f.shape.length_px + between(part[3], -2.0, 2.0), 3.0), f.shape.taper)
+        shape = NeedleShape(width, max(f.shape.length_px + between(part[3], -2.0, 2.0), 3.0), taper)
         angles = f.angles + part[4 : 4 + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
         slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (_OF_SLANTS[arms] @ part[4 + turning :]).reshape(2, arms)
         slants = np.clip(slants, [[-_SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
@@ -269,7 +289,7 @@ def _common_errors(windows: list[_Window], systems: list[_Equations], normal: Fl
 
 def _finished(window: _Window, e: _Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
     arms = len(e.members[0].angles)
-    turning = 1 if e.by_common.shape[1] > 2 else arms
+    turning = 1 if e.by_common.shape[1] > _SHARED else arms
     step = 4 + turning + _OF_SLANTS[arms].shape[1]
     tips = [step * i + axis for i in range(len(e.members)) for axis in range(2)]
     to_own = (solve_triangular(e.triangle, e.basis.T).T / e.scale).T[tips]
