@@ -16,6 +16,7 @@ from rsa_vision.detect.shared import fit_shared
 
 _BENDS = (0.6, 0.85, 0.95, 0.985, 0.999)
 _SAMPLE = 18  # arms that are asked
+_STEPS = 4  # for a first estimate
 
 
 def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> Optics:
@@ -39,7 +40,7 @@ def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, 
     sample = sample[: _SAMPLE // len(sample[0].angles)]
 
     def tried(start: Optics) -> tuple[float, Optics]:
-        fits, found = fit_shared(film, sample, start, noise, parallel=False)
+        fits, found = fit_shared(film, sample, start, noise, parallel=False, steps=_STEPS)
         return float(np.mean([f.chi2_core for f in fits])), found
 
     starts = [optics, *(replace(optics, bend=bend) for bend in _BENDS)] if optics.rough else [optics]

@@ -24,8 +24,9 @@ from rsa_vision.types import Bool, Float
 Images = Callable[[Float, Float], Float]
 """Images of some marks at pixels (cols, rows), in film values over the background."""
 CELL = 0.3  # pixels between the nodes of a needle table
-GRID_W, GRID_L = 0.25, 0.2  # pixels between the shapes that have tables of their own
-GRID_Q, GRID_SKEW = 0.06, 0.1  # as well, of the slant; step of the skew for its derivative
+GRID_W, GRID_L = 0.25, 1.0  # pixels between the shapes that have tables of their own
+FINE_L, FINE_Q = 0.2, 0.06  # pixels of the length, and the slant, between those of the last fit
+SKEW = 0.1  # for the derivative
 _OF_TABLE = CELL**2 / 4  # variance that the mean over a cell and linear interpolation between nodes add to the blur
 _PAD = 6.0  # blur widths around the needle that a table covers
 _STEPS = 14
@@ -137,17 +138,18 @@ def _table(
     One look-up finds them all.
     """
     film = sigma, mu, bend, slant or 0.0
+    step_l = GRID_L if slant is None else FINE_L
     base, s0, p0 = _opacity(half_width, length, taper, *film)
     wide, *_, p1 = _opacity(round(half_width + GRID_W, 4), length, taper, *film)
-    long, *_ = _opacity(half_width, round(length + GRID_L, 4), taper, *film)
+    long, *_ = _opacity(half_width, round(length + step_l, 4), taper, *film)
     side = round((p0 - p1) / CELL)
     by_width = (wide[: base.shape[0], side : side + base.shape[1]] - base) / GRID_W
-    by_length = (long[: base.shape[0]] - base) / GRID_L
+    by_length = (long[: base.shape[0]] - base) / step_l
     nodes = [base, np.gradient(base, CELL, axis=0), np.gradient(base, CELL, axis=1), by_width, by_length]
     if slant is not None:
-        more = _opacity(half_width, length, taper, sigma, mu, bend, round(slant + GRID_Q, 4))[0]
-        skew = _opacity(half_width, length, taper, *film, GRID_SKEW)[0]
-        nodes += [(more - base) / GRID_Q, (skew - base) / GRID_SKEW]
+        more = _opacity(half_width, length, taper, sigma, mu, bend, round(slant + FINE_Q, 4))[0]
+        skew = _opacity(half_width, length, taper, *film, SKEW)[0]
+        nodes += [(more - base) / FINE_Q, (skew - base) / SKEW]
     return np.stack(nodes, axis=-1).reshape(-1, len(nodes)), base.shape, s0, p0
 
 
@@ -195,7 +197,7 @@ def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: 
     With slants, those by the slant and by the skew of each arm follow.
     """
     # tables stand on a grid of shapes, shared by all needles of a film; in between the image is linear in the shape
-    off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % GRID_L
+    off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % (GRID_L if slants is None else FINE_L)
     film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
     key = round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4), round(shape.taper, 3), *film
     c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
@@ -205,7 +207,7 @@ def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: 
         base, g_s, g_p, more_w, more_l = _look_up(_table(*key), along.ravel(), across.ravel()).reshape(5, *along.shape)
     else:
         slant, skew = slants
-        off_q = np.where(slant > 0, slant % GRID_Q, slant)
+        off_q = np.where(slant > 0, slant % FINE_Q, slant)
         arms = [_look_up(_table(*key, round(q, 4)), a, b) for q, a, b in zip(slant - off_q, along, across, strict=True)]
         base, g_s, g_p, more_w, more_l, *ends = np.stack(arms, axis=1)
         base = base + off_q[:, None] * ends[0] + skew[:, None] * ends[1]

@@ -22,16 +22,18 @@ from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, core_p
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Float
+from rsa_vision.types import Float, Int
 
 _STEPS = 8
-_CONVERGED_PX = 1e-3
+_CONVERGED = 0.1  # standard deviations of a tip, where those are not below
+_FINEST_PX = 0.02  # for the tables are interpolated
 _STEP = 0.05  # of the logarithms of attenuation and blur, and of the taper, for derivatives
-_ATTENUATION_ERROR, _BLUR_ERROR, _ROUGH_BLUR = 0.7, 0.15, 0.3  # of the logarithms, before the needles are asked; rough: no ball told it
+_ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
 _TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
 _SHARED = 3  # attenuation, blur, taper
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
-_MOST_BY_STEP = 0.3  # of all these
+_MUCH = 0.15  # of the logarithms, from which derivatives by them are taken anew
+_MOST_BY_STEP = 0.6  # of all these
 _SLANT, _SKEW = 0.2, 0.1  # expected sizes: rays cross a film at slopes of up to a half
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 # slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
@@ -67,7 +69,6 @@ class _Equations:
     images: list[Float]
     weight: Float
     left: Float
-    ground: Float
     background: float
     residual: Float
     basis: Float
@@ -75,10 +76,23 @@ class _Equations:
     scale: Float
     by_common: Float
     common: Float
+    parallel: bool
 
     def own(self, target: Float) -> Float:
         """Own parameters that explain a target (n,) or (n, m), shape (p,) or (p, m)."""
         return np.asarray((solve_triangular(self.triangle, self.basis.T @ target).T / self.scale).T)
+
+    @property
+    def sharpest_px(self) -> float:
+        """Least standard deviation of a tip's coordinate."""
+        rows = solve_triangular(self.triangle, np.eye(len(self.scale)))[self.tips] / self.scale[self.tips, None]
+        return float(np.linalg.norm(rows, axis=1).min())
+
+    @property
+    def tips(self) -> Int:
+        """Places of the coordinates of the tips among the own parameters."""
+        each = _own_parameters(len(self.members[0].angles), self.parallel)
+        return np.add.outer(each * np.arange(len(self.members)), [0, 1]).ravel()
 
     @property
     def excess(self) -> float:
@@ -87,7 +101,7 @@ class _Equations:
 
 
 def fit_shared(
-    film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, parallel: bool
+    film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, parallel: bool, steps: int = _STEPS
 ) -> tuple[list[NeedleFit], Optics]:
     """Fit all needles of a film and their common attenuation, blur and directions.
 
@@ -101,6 +115,8 @@ def fit_shared(
     noise : NoiseModel
     parallel : bool
         The arms of all needles have the same directions against their first; else each arm its own.
+    steps : int
+        At the most.
 
     Returns
     -------
@@ -113,16 +129,19 @@ def fit_shared(
     parallel = parallel and len(needles[0].angles) > 1
     sets = clusters(needles)
     windows = [_window(film, members, needles, optics, noise) for members in sets]
-    slopes = [_by_optics(w, members, optics) for w, members in zip(windows, sets, strict=True)]
-    before = [_ATTENUATION_ERROR, _ROUGH_BLUR if optics.rough else _BLUR_ERROR, _TAPER_ERROR]
+    before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR]
     precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     moved = np.zeros(len(precision))
     start, taper = optics, needles[0].shape.taper
+    slopes: list[list[Float]] = []
+    since = np.full(_SHARED, np.inf)
     converged = False
-    for step in range(_STEPS + 1):
+    for step in range(steps + 1):
+        if np.abs(moved[:_SHARED] - since).max() > _MUCH:
+            slopes, since = [_by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:_SHARED].copy()
         systems = [_linearise(w, m, k, optics, noise, parallel) for w, m, k in zip(windows, sets, slopes, strict=True)]
         normal = precision + sum(e.common.T @ e.common / e.excess for e in systems)
-        if step == _STEPS or converged:
+        if step == steps or converged:
             break
         change = _step(normal, sum(e.common.T @ e.residual / e.excess for e in systems) - precision @ moved, taper)
         moved += change
@@ -131,9 +150,9 @@ def fit_shared(
         furthest = 0.0
         for i, e in enumerate(systems):
             delta = e.own(e.residual - e.by_common @ change)
-            sets[i], far = _moved(e.members, delta, change[_SHARED:], taper, parallel)
-            furthest = max(furthest, far)
-        converged = step > 0 and furthest < _CONVERGED_PX
+            sets[i], shift = _moved(e.members, delta, change[_SHARED:], taper, parallel)
+            furthest = max(furthest, shift / max(e.sharpest_px, _FINEST_PX))
+        converged = step > 0 and furthest < _CONVERGED
     errors = _common_errors(windows, systems, normal, precision, noise)
     out = []
     for window, e in zip(windows, systems, strict=True):
@@ -178,7 +197,7 @@ def _arms(window: _Window, fit: NeedleFit, optics: Optics) -> Float:
 
 
 def _by_optics(window: _Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
-    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n); they hardly change on the way."""
+    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n)."""
     factor = np.exp(_STEP)
     denser, wider = replace(optics, mu_px=optics.mu_px * factor), replace(optics, sigma_px=optics.sigma_px * factor)
     out = []
@@ -239,7 +258,6 @@ def _linearise(
         images,
         weight,
         left,
-        ground,
         float(theta[-window.surface.shape[1]]),
         residual,
         basis,
@@ -247,7 +265,13 @@ def _linearise(
         scale,
         by_common,
         by_common - basis @ (basis.T @ by_common),
+        parallel,
     )
+
+
+def _own_parameters(arms: int, parallel: bool) -> int:
+    """Count tip (2), half width, length, one or all directions and what the ends have; the depths are linear."""
+    return 4 + (1 if parallel else arms) + int(_OF_SLANTS[arms].shape[1])
 
 
 def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, taper: float, parallel: bool) -> tuple[list[NeedleFit], float]:
@@ -288,11 +312,7 @@ def _common_errors(windows: list[_Window], systems: list[_Equations], normal: Fl
 
 
 def _finished(window: _Window, e: _Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
-    arms = len(e.members[0].angles)
-    turning = 1 if e.by_common.shape[1] > _SHARED else arms
-    step = 4 + turning + _OF_SLANTS[arms].shape[1]
-    tips = [step * i + axis for i in range(len(e.members)) for axis in range(2)]
-    to_own = (solve_triangular(e.triangle, e.basis.T).T / e.scale).T[tips]
+    to_own = (solve_triangular(e.triangle, e.basis.T).T / e.scale).T[e.tips]
     influence = influence_covariance(_patch(window, to_own[:, : len(e.weight)]), noise.correlation)
     by_common = to_own @ e.by_common
     covariance = influence + by_common @ errors @ by_common.T

@@ -21,6 +21,7 @@ from rsa_vision.detect.templates import find_like
 from rsa_vision.detect.twins import split_twins
 from rsa_vision.types import Float
 
+_BEFORE = 1.5  # tolerance before attenuation and ends are fitted
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
 _MOST_JUNCTIONS = 80
@@ -65,13 +66,14 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
         return others_beside(mine, [t for t in around if all(t is not m for m in mine)], optics)
 
     tees = split_twins(film, tees, optics, noise, is_tee, beside)
-    optics = common_optics(film, tees, optics, noise)
-    tees = fit_all(film, tees, optics, noise)
+    if optics.rough:
+        optics = common_optics(film, tees, optics, noise)
+        tees = fit_all(film, tees, optics, noise)
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
-    clean = [t for t in tees if is_tee(t)]
-    clean, optics = fit_shared(film, clean, optics, noise, parallel=len(clean) >= _LEAST_PARALLEL)
-    clean = [t for t in clean if is_tee(t)]
-    return clean, [t for t in tees if not is_tee(t) and is_tee(t, slack=ROUGH)], optics
+    nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
+    fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
+    others = [t for t in tees if not is_tee(t, slack=_BEFORE)] + [replace(t, slants=None) for t in fitted if not is_tee(t)]
+    return [t for t in fitted if is_tee(t)], [t for t in others if is_tee(t, slack=ROUGH)], optics
 
 
 def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> Optics:
