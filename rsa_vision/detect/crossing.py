@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import polynomial
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, beyond_ends, core_pixels, significance_of, support
+from rsa_vision.detect.needles import Images, NeedleFit, NeedleShape, arm_images, core_pixels, significance_of, support
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
@@ -28,8 +28,7 @@ def fit_crossing(
     optics: Optics,
     noise: NoiseModel,
     *,
-    others: Any = None,
-    ends: bool = True,
+    others: Images | None = None,
     steps: int = _STEPS,
 ) -> list[NeedleFit]:
     """Fit several pins or tees at once; the arms of each turn together.
@@ -42,10 +41,7 @@ def fit_crossing(
     optics : Optics
     noise : NoiseModel
     others : callable, optional
-        As of :func:`rsa_vision.detect.needles.fit_needles`.
-    ends : bool
-        As there: True has the thick ends take part, each needle's length free and one depth for its arms; False leaves the ends out, holds
-        lengths and gives every arm its own depth.
+        Images of neighbours, which are subtracted first.
     steps : int
         At the most.
 
@@ -67,37 +63,26 @@ def fit_crossing(
     for f in now:
         dx, dy = cols - f.position_px[0], rows - f.position_px[1]
         near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + 4.0)
-        if not ends:
-            keep &= ~beyond_ends(dx, dy, f.angles, f.shape, optics.sigma_px)
     keep &= near
     cols, rows, raw = cols[keep], rows[keep], patch.values[0][keep]
-    neighbours = np.zeros_like(raw)
-    if others is not None:
-        neighbours, doubtful = others(cols, rows)
-        cols, rows, raw, neighbours = (array[~doubtful] for array in (cols, rows, raw, neighbours))
+    neighbours = np.zeros_like(raw) if others is None else others(cols, rows)
     data = raw - neighbours
     surface = polynomial(half, cols - middle[0], rows - middle[1])
     weight = 1.0 / noise.variance_at(raw)
-    n_shape = 2 if ends else 1
-    each = 2 + n_shape + 1
+    each = 5
     converged = False
     ground = np.zeros(len(data))  # background above its mean under each pixel
     for step in range(steps + 1):
         blocks = [arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, optics) for f in now]
         if optics.proportion:
-            blocks = [block * _gain(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
-        images = [b[0].sum(0, keepdims=True) if ends else b[0] for b in blocks]
-        counts = [len(i) for i in images]
-        linear = columns([*images, *_lapping([b[0].sum(0) for b in blocks]), surface.T])
+            blocks = [block * gain_at(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
+        linear = columns([*(b[0].sum(0, keepdims=True) for b in blocks), *lapping([b[0].sum(0) for b in blocks]), surface.T])
         theta = weighted_least_squares(linear, weight, data, 1e-6)
         ground = surface[:, 1:] @ theta[-surface.shape[1] + 1 :]
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        now = [
-            replace(f, depths=np.broadcast_to(theta[a:b], f.angles.shape).copy()) for f, a, b in zip(now, starts, starts[1:], strict=False)
-        ]
+        now = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta[: len(now)], strict=True)]
         moves = []
         for f, (_, d_col, d_row, d_w, d_l, d_angle) in zip(now, blocks, strict=True):
-            moves += [(f.depths @ d)[None] for d in (d_col, d_row, d_w, d_l)[: 2 + n_shape]] + [(f.depths @ d_angle)[None]]
+            moves += [(f.depths @ d)[None] for d in (d_col, d_row, d_w, d_l)] + [(f.depths @ d_angle)[None]]
         jac = columns([*moves, linear.T])
         residual = data - linear @ theta
         if step == steps or converged:
@@ -106,41 +91,62 @@ def fit_crossing(
             weight = 1.0 / noise.variance_at(linear @ theta + neighbours)
         delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 4 else 1e-6)[: each * len(now)].reshape(-1, each)
         scale = min(1.0, 1.0 / max(float(np.abs(delta[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(delta[:, -1]).max()), 1e-9))
-        now = [_moved(f, scale * d, half, ends) for f, d in zip(now, delta, strict=True)]
+        now = [_moved(f, scale * d, half) for f, d in zip(now, delta, strict=True)]
         converged = step > 1 and float(np.abs(delta[:, :2]).max()) < _CONVERGED_PX
     covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
     places = [each * i + axis for i in range(len(now)) for axis in range(2)]
     influence = np.zeros((len(places), patch.size, patch.size))
     at = (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)
     influence[:, *at] = covariance[places] @ (jac * np.sqrt(weight)[:, None]).T
+    variance = float(noise.variance_at(np.array([theta[-6]]))[0])
     out = []
-    square = weight * residual**2
     for i, (f, block) in enumerate(zip(now, blocks, strict=True)):
-        image = f.depths @ block[0]
-        depth = float(f.depths.mean())
-        core = np.abs(image) > 0.08 * max(float(np.abs(image).max()), 1e-9)
-        chi2_core = float(square[core].mean()) if core.any() else np.inf
-        raised = float((weight * (residual + image) ** 2)[core].sum())
-        variance = float(noise.variance_at(np.array([theta[-6]]))[0])
-        out.append(
-            replace(
-                f,
-                depth=depth,
-                background=float(theta[-6]),
-                covariance_px2=influence_covariance(influence[2 * i : 2 * i + 2], noise.correlation),
-                n_core=int(core.sum()),
-                valid_fraction=min(1.0, int(core.sum()) / max(core_pixels(f.position_px, f.angles, f.shape, optics.sigma_px, ends), 1)),
-                chi2_core=chi2_core,
-                explained=1.0 - float(square[core].sum()) / max(raised, 1e-12),
-                misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
-                significance=significance_of(image, surface, weight),
-                converged=converged,
-            )
-        )
+        fit = replace(f, covariance_px2=influence_covariance(influence[2 * i : 2 * i + 2], noise.correlation), converged=converged)
+        whole = core_pixels(f.position_px, f.angles, f.shape, optics.sigma_px)
+        out.append(scored(fit, f.depths @ block[0], residual, weight, surface, float(theta[-6]), variance, whole))
     return out
 
 
-def _lapping(shadows: Sequence[Float]) -> list[Float]:
+def scored(
+    fit: NeedleFit, image: Float, residual: Float, weight: Float, surface: Float, background: float, variance: float, whole: int
+) -> NeedleFit:
+    """Return a fit with its figures of merit, taken under its own arms.
+
+    Parameters
+    ----------
+    fit : NeedleFit
+    image, residual, weight : ndarray of shape (n,)
+        Its image, what the fit leaves, one over the variance of a pixel.
+    surface : ndarray of shape (n, p)
+        Columns of the background.
+    background, variance : float
+        Film value, and of the noise there.
+    whole : int
+        Pixels under the arms, were nothing hidden.
+
+    Returns
+    -------
+    NeedleFit
+    """
+    square = weight * residual**2
+    depth = float(fit.depths.mean())
+    core = np.abs(image) > 0.08 * max(float(np.abs(image).max()), 1e-9)
+    chi2_core = float(square[core].mean()) if core.any() else np.inf
+    raised = float((weight * (residual + image) ** 2)[core].sum())
+    return replace(
+        fit,
+        depth=depth,
+        background=background,
+        n_core=int(core.sum()),
+        valid_fraction=min(1.0, int(core.sum()) / max(whole, 1)),
+        chi2_core=chi2_core,
+        explained=1.0 - float(square[core].sum()) / max(raised, 1e-12),
+        misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
+        significance=significance_of(image, surface, weight),
+    )
+
+
+def lapping(shadows: Sequence[Float]) -> list[Float]:
     """Return the product of the shadows of two needles, summed over all pairs, as one row, if any lie on each other.
 
     There the film does not show their sum: its curve is bent, and those of two exposures take of each half the light. How much of the
@@ -152,7 +158,7 @@ def _lapping(shadows: Sequence[Float]) -> list[Float]:
     return [product[None]] if product.max(initial=0.0) > _LAPPING else []
 
 
-def _gain(fit: NeedleFit, ground: Float, optics: Optics) -> Float | float:
+def gain_at(fit: NeedleFit, ground: Float, optics: Optics) -> Float | float:
     """Return the depth at each pixel in units of the depth at the middle, where it goes with the background."""
     if not fit.depth:
         return 1.0
@@ -160,12 +166,13 @@ def _gain(fit: NeedleFit, ground: Float, optics: Optics) -> Float | float:
     return gain
 
 
-def _moved(fit: NeedleFit, delta: Float, half: int, ends: bool) -> NeedleFit:
-    wider, longer = _between(delta[2], -0.5, 0.5), _between(delta[3], -2.0, 2.0) if ends else 0.0
-    width = _between(fit.shape.half_width_px + wider, 0.6, 0.3 * fit.shape.length_px)
-    shape = NeedleShape(width, _between(fit.shape.length_px + longer, 3.0, half / 1.05), fit.shape.taper)
+def _moved(fit: NeedleFit, delta: Float, half: int) -> NeedleFit:
+    wider, longer = between(delta[2], -0.5, 0.5), between(delta[3], -2.0, 2.0)
+    width = between(fit.shape.half_width_px + wider, 0.6, 0.3 * fit.shape.length_px)
+    shape = NeedleShape(width, between(fit.shape.length_px + longer, 3.0, half / 1.05), fit.shape.taper)
     return replace(fit, position_px=fit.position_px + delta[:2], shape=shape, angles=fit.angles + delta[-1])
 
 
-def _between(value: float, low: float, high: float) -> float:
+def between(value: float, low: float, high: float) -> float:
+    """Return a value, or the bound that it exceeds."""
     return min(max(float(value), low), high)

@@ -18,7 +18,7 @@ from rsa_vision.detect.needles import NeedleFit, arm_images, needle_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Float
 
 _ROUNDS = 5
 _STEP_PX = 0.01  # for differences of the ball's image
@@ -62,10 +62,11 @@ def part(
         dx, dy = cols - tee.position_px[0], rows - tee.position_px[1]
         return beside(cols, rows) + needle_image(dx, dy, tee, tee_optics)
 
-    def without_ball(cols: Float, rows: Float) -> tuple[Float, Bool]:
+    def without_ball(cols: Float, rows: Float) -> Float:
         dx, dy = (cols - ball.position_px[0, 0]).reshape(1, -1), (rows - ball.position_px[0, 1]).reshape(1, -1)
         image = ball.depth[0] * ball_image(dx, dy, ball.radius_px, optics.sigma_px, optics.mu_px).reshape(cols.shape)
-        return beside(cols, rows) + image, np.zeros(cols.shape, bool)
+        total: Float = beside(cols, rows) + image
+        return total
 
     place = _brightest_rest(film, tee, np.sign(depth), without_tee)
     ball = fit_group(film, place[None], np.array([radius]), optics.sigma_px, optics.mu_px, noise, without_tee)

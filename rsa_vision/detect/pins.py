@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
-from rsa_vision.detect.needle_sets import TAPERS, common_optics, fit_all, with_error_of_optics
+from rsa_vision.detect.needle_optics import common_optics
+from rsa_vision.detect.needle_sets import TAPERS, fit_all
 from rsa_vision.detect.needles import NeedleFit, NeedleShape, explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.shared import fit_shared
 from rsa_vision.types import Bool, Float
 
 SLIM = 4.5  # length over half the width; two balls side by side have four
@@ -26,7 +28,7 @@ _SURER_THAN_ROD = 12.0  # half the chi2 by which a rod must be worse
 _ROD = 0.02  # taper of a rod: blunt
 _NEAREST_PX = 3.0
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
-_POINT = 0.05  # of the half width: no point is a cone to more than that
+_POINT = 0.01  # of the half width: no point is a cone to more than that
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
 _OF_A_KIND = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
 _SAMPLE = 6
@@ -112,9 +114,9 @@ def find_pins(
     pins = [f for f in _distinct([f for f in pins if is_pin(f)]) if _is_pointed(film, f, optics, noise)]
     typical = float(np.median([f.shape.length_px for f in pins[:_SAMPLE]])) if pins else 0.0
     pins = [f for f in pins if 1 / _OF_A_KIND < f.shape.length_px / typical < _OF_A_KIND]
-    # the flat end of a pin at a slant is an ellipse, which the model does not have: it is left out of the last fit
-    pins = [f for f in fit_all(film, pins, optics, noise, ends=False) if is_pin(f)]
-    return [_with_error_of_point(f) for f in with_error_of_optics(film, pins, optics, noise)] if pins else [], optics
+    pins = [f for f in fit_all(film, pins, optics, noise, again=True) if is_pin(f)]
+    pins, optics = fit_shared(film, pins, optics, noise, parallel=False)
+    return [_with_error_of_point(f) for f in pins if is_pin(f)], optics
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:

@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 from rsa_vision.detect.crossing import fit_crossing
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.junctions import RINGS_PX
-from rsa_vision.detect.needle_sets import TAPERS, clusters, common_optics, fit_all, others_beside
+from rsa_vision.detect.needle_optics import common_optics
+from rsa_vision.detect.needle_sets import TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles import NeedleFit, NeedleShape, explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.shared import fit_shared
 from rsa_vision.detect.templates import find_like
 from rsa_vision.detect.twins import split_twins
 from rsa_vision.types import Float
 
+_BEFORE = 1.5  # tolerance before attenuation and ends are fitted
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
 _MOST_JUNCTIONS = 80
@@ -26,8 +29,6 @@ _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _FAINTEST = 0.05  # of the depth of the film's clearest tee: a film linear in exposure has little of it behind thick tissue
 _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _NEAREST_PX = 3.0  # two tips nearer than this are one
-_MOST_PARALLEL = 24  # of those, the ones looked at
-_OUTLYING = 3.0  # standard deviations from which a direction is an error
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
 _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
@@ -56,27 +57,23 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
         return [], [], optics
     tees = _like(film, models, optics, noise)
     for again in (False, True):
-        tees = _distinct(fit_all(film, tees, optics, noise, ends=True, again=again), models[0])
+        tees = _distinct(fit_all(film, tees, optics, noise, again=again), models[0])
     if not tees:
         return [], [], optics
     around = tees
 
     def beside(mine: list[NeedleFit]) -> Any:
-        return others_beside(mine, [t for t in around if all(t is not m for m in mine)], optics, ends=True)
+        return others_beside(mine, [t for t in around if all(t is not m for m in mine)], optics)
 
     tees = split_twins(film, tees, optics, noise, is_tee, beside)
-    optics = common_optics(film, tees, optics, noise)
-    tees = fit_all(film, tees, optics, noise, ends=True)
-    offsets, error = _common_directions(film, tees, optics, noise)
-    if offsets is not None:
-        tees = [replace(t, angles=_mean_turn(t.angles, offsets) + offsets) for t in tees]
-    # with the directions held, the slanted thick ends can no longer turn the arms: they may lend their weight
-    tees = fit_all(film, tees, optics, noise, ends=offsets is not None)
-    clean = [t for t in tees if is_tee(t)]
-    if clean and offsets is not None:
-        effect = _effect_of_directions(film, clean, error, optics, noise)
-        clean = [replace(t, covariance_px2=t.covariance_px2 + effect) for t in clean]
-    return clean, [t for t in tees if not is_tee(t) and is_tee(t, slack=ROUGH)], optics
+    if optics.rough:
+        optics = common_optics(film, tees, optics, noise)
+        tees = fit_all(film, tees, optics, noise)
+    # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
+    nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
+    fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
+    others = [t for t in tees if not is_tee(t, slack=_BEFORE)] + [replace(t, slants=None) for t in fitted if not is_tee(t)]
+    return [t for t in fitted if is_tee(t)], [t for t in others if is_tee(t, slack=ROUGH)], optics
 
 
 def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> Optics:
@@ -173,7 +170,7 @@ def _peeled(film: NDArray[Any], starts: list[NeedleFit], optics: Optics, noise: 
         if in_vain == _MOST_IN_VAIN:
             break
         in_vain += 1
-        others = others_beside(start, kept, optics, ends=True)
+        others = others_beside(start, kept, optics)
         fit = fit_crossing(film, [start], optics, noise, others=others, steps=3)[0]
         deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > _FAINTEST * abs(start.depth)
         near = np.hypot(*(fit.position_px - start.position_px)) < 2 * _NEAREST_PX
@@ -190,48 +187,3 @@ def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
         if deep and is_tee(fit, slack=ROUGH) and all(np.hypot(*(fit.position_px - k.position_px)) > _NEAREST_PX for k in kept):
             kept.append(fit)
     return kept
-
-
-def _common_directions(film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel) -> tuple[Float | None, Float]:
-    """Return the directions of the arms relative to the first, if the film's tees share them, and their standard errors.
-
-    Arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along the arms meet, so what is known of their
-    directions sharpens it. Directions are taken from tees that stand alone, each arm free.
-    """
-    alone = [c[0] for c in clusters(tees) if len(c) == 1]
-    sample = sorted(alone if len(alone) >= _LEAST_PARALLEL else tees, key=lambda f: f.misfit)[:_MOST_PARALLEL]
-    if len(sample) < _LEAST_PARALLEL:
-        return None, np.zeros(3)
-    free = []
-    for t in sample:
-        others = others_beside(t, [o for o in tees if o is not t], optics, ends=False)
-        fit = fit_needles(film, t.position_px, t.angles, t.shape, optics, noise, others=others, ends=False, quick=True)
-        if is_tee(fit, slack=1.5):
-            free.append(np.angle(np.exp(1j * (fit.angles - fit.angles[0]))))
-    if len(free) < _LEAST_PARALLEL:
-        return None, np.zeros(3)
-    turns = np.array(free)
-    away = np.abs(turns - np.median(turns, axis=0))
-    spread = np.maximum(1.4826 * np.median(away, axis=0), 1e-9)
-    turns = turns[(away < _OUTLYING * spread).all(axis=1)]
-    return turns.mean(axis=0), turns.std(axis=0) / np.sqrt(len(turns) - 1)
-
-
-def _mean_turn(angles: Float, offsets: Float) -> float:
-    turn: float = np.angle(np.exp(1j * (angles - offsets)).mean())
-    return turn
-
-
-def _effect_of_directions(film: NDArray[Any], tees: list[NeedleFit], error: Float, optics: Optics, noise: NoiseModel) -> Float:
-    """Return the covariance of a tip by errors of the common directions, shape (2, 2): shifts of the cleanest tee, each arm turned."""
-    tee = min(tees, key=lambda f: f.misfit)
-    others = others_beside(tee, [t for t in tees if t is not tee], optics, ends=True)
-
-    def tip(angles: Float) -> Float:
-        return fit_crossing(film, [replace(tee, angles=angles)], optics, noise, others=others)[0].position_px
-
-    middle, effect = tip(tee.angles), np.zeros((2, 2))  # not where it was: it may have been fitted together with others
-    for k in np.nonzero(error)[0]:
-        shift = tip(tee.angles + error[k] * (np.arange(len(error)) == k)) - middle
-        effect += np.outer(shift, shift)
-    return effect

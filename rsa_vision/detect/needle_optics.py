@@ -1,0 +1,47 @@
+"""A first estimate of blur, attenuation and film curve from the cleanest pins or tees of a film."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.needle_sets import clusters
+from rsa_vision.detect.needles import NeedleFit
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.shared import fit_shared
+
+_BENDS = (0.6, 0.85, 0.95, 0.985, 0.999)
+_SAMPLE = 18  # arms that are asked
+_STEPS = 4  # for a first estimate
+
+
+def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> Optics:
+    """Estimate what the images of the cleanest needles have in common.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    needles : list of NeedleFit
+        All pins or all tees.
+    optics : Optics
+        Start. Only where its blur is rough is the bend of the film curve asked for, too.
+    noise : NoiseModel
+
+    Returns
+    -------
+    Optics
+    """
+    alone = [c[0] for c in clusters(needles) if len(c) == 1] or needles
+    sample = sorted(alone, key=lambda f: f.misfit)
+    sample = sample[: _SAMPLE // len(sample[0].angles)]
+
+    def tried(start: Optics) -> tuple[float, Optics]:
+        fits, found = fit_shared(film, sample, start, noise, parallel=False, steps=_STEPS)
+        return float(np.mean([f.chi2_core for f in fits])), found
+
+    starts = [optics, *(replace(optics, bend=bend) for bend in _BENDS)] if optics.rough else [optics]
+    return min((tried(start) for start in starts), key=lambda item: item[0])[1]

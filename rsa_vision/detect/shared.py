@@ -1,0 +1,326 @@
+"""The last fit of a film's pins or tees: all at once, with what they have in common estimated beside what is each one's own.
+
+Errors of attenuation, blur and the directions of parallel arms move every tip the same way and do not average out over a cage. Estimated
+from one needle these are poor, from all of them they are good. Each needle's own parameters are eliminated from the normal equations
+(variable projection; Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973), so that the work goes with the number of needles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from rsa_vision.detect.balls import polynomial
+from rsa_vision.detect.crossing import between, gain_at, lapping, scored
+from rsa_vision.detect.needle_sets import clusters, others_beside
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, core_pixels, support
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.patches import columns, cut, weighted_least_squares
+from rsa_vision.detect.profiles import Optics
+from rsa_vision.types import Float, Int
+
+_STEPS = 8
+_CONVERGED = 0.1  # standard deviations of a tip, where those are not below
+_FINEST_PX = 0.02  # for the tables are interpolated
+_STEP = 0.05  # of the logarithms of attenuation and blur, and of the taper, for derivatives
+_ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
+_TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
+_SHARED = 3  # attenuation, blur, taper
+_DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
+_MUCH = 0.15  # of the logarithms, from which derivatives by them are taken anew
+_MOST_BY_STEP = 0.6  # of all these
+_SLANT, _SKEW = 0.2, 0.1  # expected sizes: rays cross a film at slopes of up to a half
+_MOST_SLANT, _MOST_SKEW = 0.6, 0.3
+# slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
+_OF_SLANTS = {
+    1: np.eye(2),
+    3: np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0, 0, -1]]),
+}
+_RIDGE = 1e-4  # relative: keeps what the pixels do not determine where it is
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    """Pixels of needles that are fitted together; ``beside``: images of the others there."""
+
+    cols: Float
+    rows: Float
+    data: Float
+    beside: Float
+    surface: Float
+    corner_px: Float
+    size: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """Linearised fit of the needles of a window; rows weighted to a variance of one, those of priors last.
+
+    ``basis``, ``triangle``: of the columns of the own parameters, in units of ``scale``; ``common``: what of the columns of the common
+    ones the own ones cannot stand for.
+    """
+
+    members: list[NeedleFit]
+    images: list[Float]
+    weight: Float
+    left: Float
+    background: float
+    residual: Float
+    basis: Float
+    triangle: Float
+    scale: Float
+    by_common: Float
+    common: Float
+    parallel: bool
+
+    def own(self, target: Float) -> Float:
+        """Own parameters that explain a target (n,) or (n, m), shape (p,) or (p, m)."""
+        return np.asarray((solve_triangular(self.triangle, self.basis.T @ target).T / self.scale).T)
+
+    @property
+    def sharpest_px(self) -> float:
+        """Least standard deviation of a tip's coordinate."""
+        rows = solve_triangular(self.triangle, np.eye(len(self.scale)))[self.tips] / self.scale[self.tips, None]
+        return float(np.linalg.norm(rows, axis=1).min())
+
+    @property
+    def tips(self) -> Int:
+        """Places of the coordinates of the tips among the own parameters."""
+        each = _own_parameters(len(self.members[0].angles), self.parallel)
+        return np.add.outer(each * np.arange(len(self.members)), [0, 1]).ravel()
+
+    @property
+    def excess(self) -> float:
+        """Chi2 under the arms over what noise leaves, at least one."""
+        return max(1.0, float(np.mean((self.weight * self.left**2)[np.abs(np.sum(self.images, axis=0)) > 0])))
+
+
+def fit_shared(
+    film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, parallel: bool, steps: int = _STEPS
+) -> tuple[list[NeedleFit], Optics]:
+    """Fit all needles of a film and their common attenuation, blur and directions.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    needles : list of NeedleFit
+        Starts, all pins or all tees.
+    optics : Optics
+        Start.
+    noise : NoiseModel
+    parallel : bool
+        The arms of all needles have the same directions against their first; else each arm its own.
+    steps : int
+        At the most.
+
+    Returns
+    -------
+    needles : list of NeedleFit
+        In another order. The covariance of a tip holds the errors of what is common.
+    optics : Optics
+    """
+    if not needles:
+        return [], optics
+    parallel = parallel and len(needles[0].angles) > 1
+    sets = clusters(needles)
+    windows = [_window(film, members, needles, optics, noise) for members in sets]
+    before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR]
+    precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
+    moved = np.zeros(len(precision))
+    start, taper = optics, needles[0].shape.taper
+    slopes: list[list[Float]] = []
+    since = np.full(_SHARED, np.inf)
+    converged = False
+    for step in range(steps + 1):
+        if np.abs(moved[:_SHARED] - since).max() > _MUCH:
+            slopes, since = [_by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:_SHARED].copy()
+        systems = [_linearise(w, m, k, optics, noise, parallel) for w, m, k in zip(windows, sets, slopes, strict=True)]
+        normal = precision + sum(e.common.T @ e.common / e.excess for e in systems)
+        if step == steps or converged:
+            break
+        change = _step(normal, sum(e.common.T @ e.residual / e.excess for e in systems) - precision @ moved, taper)
+        moved += change
+        taper += change[2]
+        optics = replace(start, mu_px=start.mu_px * float(np.exp(moved[0])), sigma_px=start.sigma_px * float(np.exp(moved[1])))
+        furthest = 0.0
+        for i, e in enumerate(systems):
+            delta = e.own(e.residual - e.by_common @ change)
+            sets[i], shift = _moved(e.members, delta, change[_SHARED:], taper, parallel)
+            furthest = max(furthest, shift / max(e.sharpest_px, _FINEST_PX))
+        converged = step > 0 and furthest < _CONVERGED
+    errors = _common_errors(windows, systems, normal, precision, noise)
+    out = []
+    for window, e in zip(windows, systems, strict=True):
+        out += _finished(window, e, errors, optics, noise, converged)
+    return out, optics
+
+
+def _window(film: NDArray[Any], members: list[NeedleFit], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> _Window:
+    middle = np.mean([f.position_px for f in members], axis=0)
+    spread = max(float(np.abs(f.position_px - middle).max()) for f in members)
+    half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in members) + 3 * optics.sigma_px + 3))
+    patch = cut(film, middle[None], half, noise)
+    corner = patch.corner_px[0].astype(np.float64)
+    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
+    cols, rows = cols + corner[0], rows + corner[1]
+    near = np.zeros(cols.shape, bool)
+    for f in members:
+        near |= support(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, 3 * optics.sigma_px + 4.0)
+    near &= patch.valid[0]
+    cols, rows, raw = cols[near], rows[near], patch.values[0][near]
+    others = others_beside(members, [t for t in needles if all(t is not m for m in members)], optics)
+    beside = others(cols, rows) if others else np.zeros_like(raw)
+    return _Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]), corner, patch.size)
+
+
+def _step(normal: Float, target: Float, taper: float) -> Float:
+    """Change of the common parameters, not too far at once; the taper stays within its bounds, the others follow."""
+    change = np.linalg.solve(normal, target).astype(np.float64)
+    change *= min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9))
+    held = between(change[2], _LEAST_TAPER - taper, 1.0 - taper)
+    if held != change[2]:
+        others = np.arange(len(change)) != 2
+        change[others] = np.linalg.solve(normal[np.ix_(others, others)], target[others] - normal[others, 2] * held)
+        change[others] *= min(1.0, _MOST_BY_STEP / max(float(np.abs(change[others]).max()), 1e-9))
+        change[2] = held
+    return change
+
+
+def _arms(window: _Window, fit: NeedleFit, optics: Optics) -> Float:
+    slants = np.zeros((2, len(fit.angles))) if fit.slants is None else fit.slants
+    return arm_images(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit.angles, fit.shape, optics, slants)
+
+
+def _by_optics(window: _Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
+    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n)."""
+    factor = np.exp(_STEP)
+    denser, wider = replace(optics, mu_px=optics.mu_px * factor), replace(optics, sigma_px=optics.sigma_px * factor)
+    out = []
+    for f in members:
+        shorter = replace(f, shape=replace(f.shape, taper=f.shape.taper - _STEP))
+        here = _arms(window, f, optics)[0]
+        trials = _arms(window, f, denser)[0] - here, _arms(window, f, wider)[0] - here, here - _arms(window, shorter, optics)[0]
+        out.append(np.array(trials) / _STEP)
+    return out
+
+
+def _linearise(
+    window: _Window, members: list[NeedleFit], slopes: list[Float], optics: Optics, noise: NoiseModel, parallel: bool
+) -> _Equations:
+    blocks = [_arms(window, f, optics) for f in members]
+    # a first background for the gain; the next round has a better one
+    linear = columns([*(b[0] for b in blocks), *lapping([b[0].sum(0) for b in blocks]), window.surface.T])
+    level = np.full(len(window.data), float(window.data.mean()))
+    weight = 1.0 / noise.variance_at(level + window.beside)
+    for _ in range(2):
+        theta = weighted_least_squares(linear, weight, window.data, 1e-6)
+        weight = 1.0 / noise.variance_at(linear @ theta + window.beside)
+    ground = window.surface[:, 1:] @ theta[-window.surface.shape[1] + 1 :]
+    if optics.proportion:
+        gains = [gain_at(f, ground, optics) for f in members]
+        blocks = [b * g for b, g in zip(blocks, gains, strict=True)]
+        slopes = [s * g for s, g in zip(slopes, gains, strict=True)]
+        linear = columns([*(b[0] for b in blocks), *lapping([b[0].sum(0) for b in blocks]), window.surface.T])
+        theta = weighted_least_squares(linear, weight, window.data, 1e-6)
+    arms = len(members[0].angles)
+    now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
+    of_slants = _OF_SLANTS[arms]
+    expected = np.array([*[_SLANT] * (of_slants.shape[1] - 1), _SKEW])
+    moves, common, priors, known = [], np.zeros((_SHARED + (arms - 1) * parallel, len(weight))), [], []
+    for f, (_, d_col, d_row, d_w, d_l, d_angle, d_slant, d_skew), slope in zip(now, blocks, slopes, strict=True):
+        turns = f.depths[:, None] * d_angle
+        slants = np.zeros((2, arms)) if f.slants is None else f.slants
+        by_ends = (f.depths[:, None] * np.array([d_slant, d_skew])).reshape(2 * arms, -1)
+        moves += [(f.depths @ d)[None] for d in (d_col, d_row, d_w, d_l)]
+        moves += [turns.sum(0, keepdims=True) if parallel else turns, of_slants.T @ by_ends]
+        common[:_SHARED] += f.depths @ slope
+        if parallel:
+            common[_SHARED:] += turns[1:]
+        start = np.zeros(4 + (1 if parallel else arms))
+        priors += [start, 1 / expected]
+        known += [start, -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected]
+    root = np.sqrt(weight)
+    jac = np.concatenate([*moves, linear.T]).T * root[:, None]
+    scale = np.maximum(np.linalg.norm(jac, axis=0), 1e-12)
+    prior = np.concatenate([*priors, np.zeros(linear.shape[1])]) / scale
+    basis, triangle = np.linalg.qr(np.concatenate([jac / scale, np.diag(np.hypot(prior, _RIDGE))]))
+    by_common = np.concatenate([common.T * root[:, None], np.zeros((len(scale), len(common)))])
+    left = window.data - linear @ theta
+    residual = np.concatenate([left * root, *known, np.zeros(linear.shape[1])])
+    images = [f.depths @ b[0] for f, b in zip(now, blocks, strict=True)]
+    return _Equations(
+        now,
+        images,
+        weight,
+        left,
+        float(theta[-window.surface.shape[1]]),
+        residual,
+        basis,
+        triangle,
+        scale,
+        by_common,
+        by_common - basis @ (basis.T @ by_common),
+        parallel,
+    )
+
+
+def _own_parameters(arms: int, parallel: bool) -> int:
+    """Count tip (2), half width, length, one or all directions and what the ends have; the depths are linear."""
+    return 4 + (1 if parallel else arms) + int(_OF_SLANTS[arms].shape[1])
+
+
+def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, taper: float, parallel: bool) -> tuple[list[NeedleFit], float]:
+    """Needles after a step of their own parameters and of the common directions, and how far the furthest tip went."""
+    arms = len(members[0].angles)
+    turning = 1 if parallel else arms
+    each = 4 + turning + _OF_SLANTS[arms].shape[1]
+    parts = delta[: each * len(members)].reshape(len(members), each)
+    shift, turn = float(np.abs(parts[:, :2]).max()), float(np.abs(parts[:, 4 : 4 + turning]).max())
+    scale = min(1.0, 1.0 / max(shift, 1e-9), 0.1 / max(turn, 1e-9))
+    out = []
+    for f, part in zip(members, scale * parts, strict=True):
+        width = between(f.shape.half_width_px + between(part[2], -0.5, 0.5), 0.6, 0.3 * f.shape.length_px)
+        shape = NeedleShape(width, max(f.shape.length_px + between(part[3], -2.0, 2.0), 3.0), taper)
+        angles = f.angles + part[4 : 4 + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
+        slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (_OF_SLANTS[arms] @ part[4 + turning :]).reshape(2, arms)
+        slants = np.clip(slants, [[-_SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
+        out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants))
+    return out, shift
+
+
+def _patch(window: _Window, rows: Float) -> Float:
+    """Put values at the pixels of a window, shape (p, n), into its square."""
+    out = np.zeros((len(rows), window.size, window.size))
+    at = (window.rows - window.corner_px[1]).astype(np.intp), (window.cols - window.corner_px[0]).astype(np.intp)
+    out[:, *at] = rows
+    return out
+
+
+def _common_errors(windows: list[_Window], systems: list[_Equations], normal: Float, precision: Float, noise: NoiseModel) -> Float:
+    """Covariance of the common parameters, for noise that neighbouring pixels share."""
+    spread = precision.copy()
+    for window, e in zip(windows, systems, strict=True):
+        spread += influence_covariance(_patch(window, e.common[: len(e.weight)].T), noise.correlation) / e.excess
+    inverse = np.linalg.inv(normal)
+    covariance: Float = inverse @ spread @ inverse
+    return covariance
+
+
+def _finished(window: _Window, e: _Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
+    to_own = (solve_triangular(e.triangle, e.basis.T).T / e.scale).T[e.tips]
+    influence = influence_covariance(_patch(window, to_own[:, : len(e.weight)]), noise.correlation)
+    by_common = to_own @ e.by_common
+    covariance = influence + by_common @ errors @ by_common.T
+    variance = float(noise.variance_at(np.array([e.background]))[0])
+    out = []
+    for i, (fit, image) in enumerate(zip(e.members, e.images, strict=True)):
+        at = slice(2 * i, 2 * i + 2)
+        fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
+        whole = core_pixels(fit.position_px, fit.angles, fit.shape, optics.sigma_px)
+        out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance, whole))
+    return out
