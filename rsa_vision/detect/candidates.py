@@ -118,12 +118,14 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
 
 
 def _extrema(answer: NDArray[Any], limit: NDArray[Any], level: int, radius: float, threshold: float) -> Float:
-    high = cv2.dilate(answer, np.ones((3, 3), np.uint8))
-    low = cv2.erode(answer, np.ones((3, 3), np.uint8))
-    peak = ((answer == high) & (answer > limit)) | ((answer == low) & (answer < -limit))
-    peak[0] = peak[-1] = False
-    peak[:, 0] = peak[:, -1] = False
-    row, col = np.nonzero(peak)
+    row, col = np.divmod(np.flatnonzero((answer > limit) | (answer < -limit)), answer.shape[1])
+    whole = (row > 0) & (row < answer.shape[0] - 1) & (col > 0) & (col < answer.shape[1] - 1)
+    row, col = row[whole], col[whole]
+    # few pixels answer: to look around those costs less than filters of rank over all
+    for dr, dc in ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+        here = answer[row, col]
+        peak = np.copysign(1, here) * (here - answer[row + dr, col + dc]) >= 0
+        row, col = row[peak], col[peak]
     if len(row) == 0:
         return np.zeros((0, 5))
     centre = answer[row, col].astype(np.float64)
