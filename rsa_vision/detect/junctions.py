@@ -54,21 +54,20 @@ def _one_polarity(scaled: NDArray[Any], sign: int, margin: int, level: int) -> F
     if not strong.any():
         return np.zeros((0, 5))
     # the tips fade out, so the centre itself may answer weakly: look a little around what answers
-    row, col = np.divmod(np.flatnonzero(cv2.dilate(strong, np.ones((5, 5), np.uint8))), strong.shape[1])
+    row, col = np.divmod(np.flatnonzero(cv2.dilate(strong, np.ones((5, 5), np.uint8)) > 0), strong.shape[1])
     theta = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     quarter, eighth = DIRECTIONS // 4, DIRECTIONS // 8
-    best = np.zeros(strong.shape, np.float32)
-    angle, ring = np.zeros(strong.shape, np.float32), np.zeros(strong.shape, np.float32)
+    best, angle, ring = np.zeros((3, len(row)), np.float32)
     around_c, around_r = (np.rint(np.outer(RINGS_PX, way) / size).astype(np.intp) for way in (np.cos(theta), -np.sin(theta)))
     for radius, offset in zip(RINGS_PX, around_r * scaled.shape[1] + around_c, strict=True):
         for begin in range(0, len(row), _CHUNK):
-            r, c = row[begin : begin + _CHUNK], col[begin : begin + _CHUNK]
-            samples = scaled.ravel().take((r + margin) * scaled.shape[1] + c + margin + offset[:, None])
+            point = np.arange(begin, min(begin + _CHUNK, len(row)))
+            samples = scaled.ravel().take((row[point] + margin) * scaled.shape[1] + col[point] + margin + offset[:, None])
             # three arms that are strong enough: most points can be left out before their scores are formed
             arm = _turned(_widened(samples > LEAST if sign > 0 else samples < -LEAST))
             worth = (arm(0) & arm(quarter) & arm(-quarter)).any(0)
-            r, c, samples = r[worth], c[worth], sign * samples[:, worth]
-            if len(r) == 0:
+            point, samples = point[worth], sign * samples[:, worth]
+            if len(point) == 0:
                 continue
             beside, near = _turned(samples), _turned(_widened(samples))
             arms = np.minimum(near(0), np.minimum(near(quarter), near(-quarter)))
@@ -77,16 +76,16 @@ def _one_polarity(scaled: NDArray[Any], sign: int, margin: int, level: int) -> F
                 gaps = np.maximum(gaps, beside(turn))
             score = np.where(gaps < _GAP * arms, arms - np.maximum(gaps, 0), 0)
             k = score.argmax(0)
-            value = score[k, np.arange(len(r))]
-            better = value > best[r, c]
-            r, c, k = r[better], c[better], k[better]
-            best[r, c], angle[r, c], ring[r, c] = value[better], theta[k], radius
-    row, col = row[best[row, col] > LEAST], col[best[row, col] > LEAST]
-    around = np.pad(best, _APART)
-    highest = np.lib.stride_tricks.sliding_window_view(around, (2 * _APART + 1,) * 2)[row, col].max((1, 2), initial=0.0)
-    r, c = row[best[row, col] == highest], col[best[row, col] == highest]
-    strength = sign * best[r, c]
-    return np.stack([(c + 0.5) * size - 0.5, (r + 0.5) * size - 0.5, angle[r, c], ring[r, c], strength], axis=1).astype(np.float64)
+            value = score[k, np.arange(len(k))]
+            better = value > best[point]
+            best[point[better]], angle[point[better]], ring[point[better]] = value[better], theta[k[better]], radius
+    row, col, angle, ring, best = (v[best > LEAST] for v in (row, col, angle, ring, best))
+    around = np.zeros([n + 2 * _APART for n in strong.shape], np.float32)
+    around[row + _APART, col + _APART] = best
+    windows = np.lib.stride_tricks.sliding_window_view(around, (2 * _APART + 1,) * 2)
+    peak = best == windows[row, col].max((1, 2), initial=0.0)
+    table = np.stack([(col + 0.5) * size - 0.5, (row + 0.5) * size - 0.5, angle, ring, sign * best], axis=1)
+    return np.asarray(table[peak], np.float64)
 
 
 def _widened(samples: NDArray[Any]) -> NDArray[Any]:
