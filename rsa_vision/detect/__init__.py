@@ -19,7 +19,7 @@ from rsa_vision.detect.find import MISFIT, STRENGTH, first_look, fit_at, misfit,
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
-from rsa_vision.detect.optics import estimate_optics
+from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
@@ -33,6 +33,9 @@ STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which the
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
+_RIVAL = 0.25  # part of the evidence for one polarity from which the other is worth a look
+_BEYOND_DOUBT = 300.0  # evidence of six clear balls
+_MOST_ASKED = 40  # balls of the other polarity
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
 
@@ -91,20 +94,31 @@ def _polarities(
     film: NDArray[Any], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
 ) -> list[tuple[int, Optics]]:
     """Signs of depth worth looking at, with their optics; both only where neither is clearly the markers'."""
-    weight, optics = {}, {}
-    for sign in (-1, 1):
-        optics[sign], balls = estimate_optics(film, seeds.rows(np.sign(seeds.depth) == sign), noise)
-        strength = -sign * candidates.junctions[:, 4]
-        clear = strength > CLEAR_JUNCTION
+    mine = {sign: seeds.rows(np.sign(seeds.depth) == sign) for sign in (-1, 1)}
+    strength = {sign: -sign * candidates.junctions[:, 4] for sign in (-1, 1)}
+    of_tees = {sign: float(np.clip(strength[sign] - CLEAR_JUNCTION, 0.0, 20.0).sum()) for sign in (-1, 1)}
+    first = max((-1, 1), key=lambda sign: ball_evidence(mine[sign], noise) + of_tees[sign])
+    weight, optics = {first: 0.0, -first: 0.0}, {}
+    for sign in (first, -first):
+        of_sign = [p for p in pins if np.sign(p.depth) == sign]
+        if sign != first and weight[first] > _BEYOND_DOUBT:
+            # blur is the film's: where marks of one kind show it, those of the other would show at the same
+            few = mine[sign].rows(slice(_MOST_ASKED))
+            here = fit_at(film, few.position_px, few.radius_px, optics[first], noise, quick=True) if len(few.depth) else few
+            most = of_tees[sign] + max(ball_evidence(f, noise) for f in (mine[sign], here))
+            if most < 0.5 * _RIVAL * weight[first] and sum(min(p.significance, 50.0) for p in of_sign) < _RIVAL * weight[first]:
+                break
+        optics[sign], balls = estimate_optics(film, mine[sign], noise)
+        clear = strength[sign] > CLEAR_JUNCTION
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
-            optics[sign], balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
-        weight[sign] = balls + float(np.clip(strength - CLEAR_JUNCTION, 0.0, 20.0).sum())
+            optics[sign], balls = optics_of_pins(film, of_sign, noise)
+        weight[sign] = balls + of_tees[sign]
     best = max(weight, key=lambda sign: weight[sign])
-    if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():
+    if weight[best] == 0 and len(mine[best].depth) == 0:
         return []
-    return [(sign, optics[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
+    return [(sign, optics[sign]) for sign in ((best,) if weight[-best] < _RIVAL * weight[best] else (best, -best))]
 
 
 def _one_polarity(
