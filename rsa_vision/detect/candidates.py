@@ -55,6 +55,11 @@ class Candidates:
     junctions: Float
     strokes: Float
 
+    def rows(self, index: Any) -> Candidates:
+        """Return the extrema that ``index`` selects, with all junctions and strokes."""
+        chosen = (self.position_px[index], self.radius_px[index], self.strength[index], self.roundness[index])
+        return Candidates(*chosen, self.junctions, self.strokes)
+
 
 def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> Candidates:
     """Find local extrema of the multi-scale filter.
@@ -100,10 +105,14 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
         image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
     out = [np.zeros((0, 5))]
     junctions, strokes = np.zeros((0, 5)), [np.zeros((0, COLUMNS))]
+    blurred: dict[tuple[int, float], NDArray[Any]] = {}
     for level, inner, outer, radius in SCALES:
         source = level_images[level]
         # outer minus inner: positive where the mark is darker than its surroundings
-        answer = cv2.GaussianBlur(source, (0, 0), outer) - cv2.GaussianBlur(source, (0, 0), inner)
+        if (level, inner) not in blurred:
+            blurred = {(level, inner): cv2.GaussianBlur(source, (0, 0), inner)}
+        blurred[level, outer] = cv2.GaussianBlur(source, (0, 0), outer)  # the next scale may begin with it
+        answer = blurred[level, outer] - blurred[level, inner]
         limit = threshold * cv2.resize(
             _local_spread(answer, _white_spread(noise, level, inner, outer)),
             (answer.shape[1], answer.shape[0]),

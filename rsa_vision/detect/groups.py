@@ -98,9 +98,7 @@ def fit_group(
         depth=theta[:k],
         covariance=np.stack([whole[np.ix_(index, index)] for index in own]),
         chi2_core=(square * core).sum(1) / inside,
-        chi2_ring=uneven(
-            np.broadcast_to(residual, distance.shape), np.broadcast_to(weight * ring, distance.shape), local, size, ~core
-        ),
+        chi2_ring=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight * ring, distance.shape), local, size, ~core),
         chi2_uneven=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight, distance.shape), local, size, core),
         explained=1 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
@@ -111,9 +109,7 @@ def fit_group(
     )
 
 
-def edge_gain(
-    film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None
-) -> float:
+def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None) -> float:
     """Return twice the log-likelihood that an edge in the background would gain, to first order (the score test of Rao, 1948).
 
     No fit is needed for it: what is left of the window by balls that were fitted without an edge says how far one more step would get with

@@ -42,7 +42,7 @@ def find_junctions(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Flo
         ``limit``); negative strength for bright marks.
     """
     margin = int(RINGS_PX[-1] / 2**level) + 1
-    scaled = cv2.copyMakeBorder(cv2.divide(answer, limit), *[margin] * 4, cv2.BORDER_REPLICATE)
+    scaled = cv2.copyMakeBorder(cv2.divide(answer, limit), margin, margin, margin, margin, cv2.BORDER_REPLICATE)
     found = [_one_polarity(scaled, sign, margin, level) for sign in (1, -1)]
     return np.concatenate(found)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rsa_vision.detect.balls import BallFits, ball_image, join
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible
@@ -115,7 +115,8 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
         index = np.array(g)
         beside = _beside(fits, index, optics, tees)
         plain = fits.rows(index)
-        if len(g) > _MOST_IN_GROUP:
+        # a size at the limit is not fitted: nothing that comes to rest there is a ball
+        if len(g) > _MOST_IN_GROUP or (plain.radius_px >= RADIUS_PX[1]).any():
             parts.append(plain)
             continue
         start, radius = plain.position_px, plain.radius_px

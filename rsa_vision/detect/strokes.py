@@ -67,7 +67,7 @@ def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int, sign: i
         low, high = np.full(len(strength), values.max()), np.full(len(strength), values.min())
         np.minimum.at(low, island, values)
         np.maximum.at(high, island, values)
-        return high - low + 1
+        return np.asarray(high - low + 1)
 
     side = np.maximum(extent(r), extent(c)) * size
     x, y = mean(c.astype(np.float64)), mean(r.astype(np.float64))
@@ -97,5 +97,5 @@ def _islands(r: NDArray[np.intp], c: NDArray[np.intp]) -> NDArray[np.intp]:
     upper = np.repeat(np.arange(len(first)), n)
     lower = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n) + np.repeat(low, n)
     touching = csr_array((np.ones(len(upper), np.int8), (upper, lower)), shape=(len(first), len(first)))
-    island: NDArray[np.intp] = connected_components(touching, directed=False)[1].astype(np.intp)
-    return np.repeat(island, np.diff(np.append(begins, len(flat))))
+    island = connected_components(touching, directed=False)[1]
+    return np.asarray(np.repeat(island, np.diff(np.append(begins, len(flat)))), np.intp)
