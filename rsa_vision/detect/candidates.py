@@ -105,14 +105,13 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
         image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
     out = [np.zeros((0, 5))]
     junctions, strokes = np.zeros((0, 5)), [np.zeros((0, COLUMNS))]
-    blurred: dict[tuple[int, float], NDArray[Any]] = {}
+    last: tuple[tuple[int, float], NDArray[Any]] | None = None
     for level, inner, outer, radius in SCALES:
         source = level_images[level]
         # outer minus inner: positive where the mark is darker than its surroundings
-        if (level, inner) not in blurred:
-            blurred = {(level, inner): cv2.GaussianBlur(source, (0, 0), inner)}
-        blurred[level, outer] = cv2.GaussianBlur(source, (0, 0), outer)  # the next scale may begin with it
-        answer = blurred[level, outer] - blurred[level, inner]
+        begun = last[1] if last and last[0] == (level, inner) else cv2.GaussianBlur(source, (0, 0), inner)
+        last = (level, outer), cv2.GaussianBlur(source, (0, 0), outer)  # the next scale may begin with it
+        answer = cv2.subtract(last[1], begun, dst=begun)
         limit = threshold * cv2.resize(
             _local_spread(answer, _white_spread(noise, level, inner, outer)),
             (answer.shape[1], answer.shape[0]),
