@@ -15,7 +15,6 @@ from rsa_vision.types import Bool, Float
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; the issue's range is 2.5 to 12
 _STEPS = 12
 _REWEIGHTED = (2, 5)  # steps
-_DAMPING = 1e-6  # of normal matrices in single precision
 _BATCH = 40  # windows that stay in the cache
 COARSE_HALF_PX = 13
 _CONVERGED_PX = 2e-4
@@ -213,13 +212,9 @@ def _fit_batch(
     depth = theta[:, :1]
     jac[:, 0], jac[:, 1], jac[:, 2] = -depth * dx, -depth * dy, depth * slope_r
     residual = data - np.matmul(theta[:, None], jac[:, 3:])[:, 0]
-    weighted = jac * np.sqrt(weight)[:, None]
-    normal = np.matmul(weighted, weighted.transpose(0, 2, 1)).astype(np.float64)
-    if quick:
-        normal, scale = _scaled(normal, _DAMPING)
-        covariance = np.linalg.inv(normal)[:, :4] / (scale[:, :4, None] * scale[:, None])
-    else:
-        covariance = np.linalg.pinv(normal, hermitian=True)[:, :4]
+    weighted = jac * np.sqrt(weight, dtype=np.float64)[:, None]
+    covariance = np.linalg.pinv(np.matmul(weighted, weighted.transpose(0, 2, 1)), hermitian=True)[:, :4]
+    if not quick:
         influence = np.matmul(covariance, weighted).reshape(n, 4, size, size)
         covariance = np.stack([influence_covariance(one, noise.correlation) for one in influence])
     core = _distance(grid_c - local[:, :1], grid_r - local[:, 1:]) < (radius + sigma_px)[:, None]
@@ -285,18 +280,13 @@ def _ball(
 
 
 def _solve(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
-    root = np.sqrt(weight)
+    # products are added up in double precision: radius and depth of a ball that is small against the blur can all but stand for each other
+    root = np.sqrt(weight, dtype=np.float64)
     weighted = jac * root[:, None]
-    normal = np.matmul(weighted, weighted.transpose(0, 2, 1)).astype(np.float64)
+    normal = np.matmul(weighted, weighted.transpose(0, 2, 1))
     right = np.matmul(weighted, (root * target)[:, :, None])[:, :, 0]
-    normal, scale = _scaled(normal, damping if jac.dtype == np.float64 else _DAMPING)
+    scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
+    normal /= scale[:, :, None] * scale[:, None, :]
+    normal[:, np.arange(jac.shape[1]), np.arange(jac.shape[1])] += damping
     solution: Float = np.linalg.solve(normal, (right / scale)[:, :, None])[:, :, 0] / scale
     return solution
-
-
-def _scaled(normal: Float, damping: float) -> tuple[Float, Float]:
-    """Return normal matrices (n, p, p) with a diagonal of one and a little, and what their rows and columns were divided by."""
-    scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
-    out = normal / (scale[:, :, None] * scale[:, None, :])
-    out[:, np.arange(out.shape[1]), np.arange(out.shape[1])] += damping
-    return out, scale
