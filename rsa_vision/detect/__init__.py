@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
-from rsa_vision.detect.find import MISFIT, STRENGTH, first_look, fit_at, misfit, plausible, significance_limit
+from rsa_vision.detect.find import MISFIT, ROUNDNESS, STRENGTH, distinct, first_look, fit_at, misfit, plausible, significance_limit
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
-from rsa_vision.detect.optics import estimate_optics
+from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
@@ -32,6 +32,10 @@ __all__ = ["Detection", "detect_markers"]
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
+_STRONGEST = 100  # candidates of each polarity that are looked at first
+_BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls; then less than either of the next is no rival
+_NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
+_CAP = 50.0  # significance beyond which a needle is no better evidence
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
@@ -78,21 +82,47 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     noise = estimate_noise(values, bits)
     candidates = find_candidates(values, STRENGTH, noise)
     pins = look_for_pins(values, candidates.strokes, noise)
-    seeds = first_look(values, candidates, noise)
-    seeds = seeds.rows(~on_pins(seeds.position_px, 1 - seeds.explained, [p for p in pins if is_slim(p)]))
+    seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
         _one_polarity(values, bits, sign, optics, seeds, pins, candidates, noise, false_detections)
-        for sign, optics in _polarities(values, seeds, pins, candidates, noise)
+        for sign, optics in _polarities(values, signs, seeds, pins, candidates, noise)
     ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
 
+def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> tuple[BallFits, list[int]]:
+    """First looks, and the signs of depth that were looked at: one where the strongest candidates leave no doubt which is the markers'."""
+    candidates = candidates.rows(candidates.roundness > ROUNDNESS)
+    slim = [p for p in pins if is_slim(p)]
+    sign = -np.sign(candidates.strength)
+
+    def look(index: Any) -> BallFits:
+        fits = first_look(film, candidates.rows(index), noise)
+        return fits.rows(~on_pins(fits.position_px, 1 - fits.explained, slim))
+
+    strongest = {this: np.flatnonzero(sign == this)[:_STRONGEST] for this in (-1, 1)}
+    looks = {this: look(index) for this, index in strongest.items()}
+    evidence = {this: ball_evidence(distinct(fits, noise), noise) for this, fits in looks.items()}
+    best = max(evidence, key=lambda this: evidence[this])
+    of_needles = sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == -best) + _of_tees(candidates, -best)
+    rest = ~np.isin(np.arange(len(sign)), np.concatenate(list(strongest.values())))
+    if evidence[best] > _BEYOND_DOUBT and evidence[-best] < _NO_RIVAL and of_needles < _NO_RIVAL_OF_NEEDLES:
+        del looks[-best]
+        rest &= sign == best
+    return distinct(join([*looks.values(), look(rest)]), noise), list(looks)
+
+
+def _of_tees(candidates: Candidates, sign: int) -> float:
+    """Evidence of junctions for tees of one polarity."""
+    return float(np.clip(-sign * candidates.junctions[:, 4] - CLEAR_JUNCTION, 0.0, 20.0).sum())
+
+
 def _polarities(
-    film: NDArray[Any], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
+    film: NDArray[Any], signs: list[int], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
 ) -> list[tuple[int, Optics]]:
     """Signs of depth worth looking at, with their optics; both only where neither is clearly the markers'."""
-    weight, optics = {}, {}
-    for sign in (-1, 1):
+    weight, optics = {-1: 0.0, 1: 0.0}, {}
+    for sign in signs:
         optics[sign], balls = estimate_optics(film, seeds.rows(np.sign(seeds.depth) == sign), noise)
         strength = -sign * candidates.junctions[:, 4]
         clear = strength > CLEAR_JUNCTION
@@ -100,8 +130,8 @@ def _polarities(
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
             optics[sign], balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
-        weight[sign] = balls + float(np.clip(strength - CLEAR_JUNCTION, 0.0, 20.0).sum())
-    best = max(weight, key=lambda sign: weight[sign])
+        weight[sign] = balls + _of_tees(candidates, sign)
+    best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():
         return []
     return [(sign, optics[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
@@ -120,15 +150,7 @@ def _one_polarity(
 ) -> tuple[float, Detection]:
     seeds = seeds.rows(np.sign(seeds.depth) == sign)
     junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
-    same = np.sign(candidates.strength) == -sign
-    mine = replace(
-        candidates,
-        position_px=candidates.position_px[same],
-        radius_px=candidates.radius_px[same],
-        strength=candidates.strength[same],
-        roundness=candidates.roundness[same],
-        junctions=junctions,
-    )
+    mine = replace(candidates.rows(np.sign(candidates.strength) == -sign), junctions=junctions)
     tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]

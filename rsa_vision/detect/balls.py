@@ -14,6 +14,8 @@ from rsa_vision.types import Bool, Float
 
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; the issue's range is 2.5 to 12
 _STEPS = 12
+_REWEIGHTED = (2, 5)  # steps
+_BATCH = 40  # windows that stay in the cache
 COARSE_HALF_PX = 13
 _CONVERGED_PX = 2e-4
 _MAX_STEP_PX = 0.7
@@ -136,8 +138,8 @@ def fit_balls(
     BallFits
     """
     parts = []
-    for begin in range(0, len(start_px), 64):  # batches that stay in the cache
-        part = slice(begin, begin + 64)
+    for begin in range(0, len(start_px), _BATCH):
+        part = slice(begin, begin + _BATCH)
         chunk = Patches(patches.values[part], patches.valid[part], patches.corner_px[part])
         more = None if extra is None else extra[part]
         parts.append(_fit_batch(chunk, start_px[part], start_radius_px[part], sigma_px, mu_px, noise, more, quick))
@@ -155,59 +157,67 @@ def _fit_batch(
     quick: bool,
 ) -> BallFits:
     n, size = len(start_px), patches.size
+    kind = np.float32 if quick else np.float64  # a first look does with half the memory
     half = size // 2
     table = ball_table(round(mu_px * sigma_px, 3))
     data = patches.values if extra is None else patches.values - extra
     data = data.reshape(n, -1)
-    valid = patches.valid.reshape(n, -1).astype(np.float64)
+    valid = patches.valid.reshape(n, -1)
     # a first look at a large window does not need every pixel
     stride = 2 if quick and half > COARSE_HALF_PX else 1
     axis = np.arange(half % stride, size, stride, dtype=np.float64)
     grid_c, grid_r = (g.ravel() for g in np.meshgrid(axis, axis))
     looked_at = (grid_r * size + grid_c).astype(np.intp)
-    data, valid = data[:, looked_at], valid[:, looked_at]
-    added = None if extra is None else extra.reshape(n, -1)[:, looked_at]
+    if stride > 1:
+        data, valid = data[:, looked_at], valid[:, looked_at]
+    level = patches.values.reshape(n, -1).mean(1)[:, None]  # what is small can be added up in single precision
+    data, valid = (data - level).astype(kind), valid.astype(kind)
+    added = level if extra is None else level + extra.reshape(n, -1)[:, looked_at]
     surface = polynomial(half, grid_c - half, grid_r - half)
     local = start_px - patches.corner_px
     low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px, half - sigma_px)
     radius = np.clip(start_radius_px, low, high)
-    weight = valid / noise.variance_at(patches.values.reshape(n, -1).mean(1))[:, None]
-    jac = np.empty((n, 10, len(grid_c)))  # derivatives by col, row, radius, depth and the background's coefficients
+    weight = valid / noise.variance_at(level).astype(kind)
+    jac = np.empty((n, 10, len(grid_c)), kind)  # derivatives by col, row, radius, depth and the background's coefficients
     jac[:, 4:] = surface.T
-    theta = np.zeros((n, 7))
+    theta = np.zeros((n, 7), kind)
     converged = np.zeros(n, bool)
-    model = data
+    busy = np.arange(n)
     for step in range(4 if quick else _STEPS):
-        value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px)
-        jac[:, 3] = value
+        now, seen, j = weight[busy], data[busy], jac[: len(busy)]
+        value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local[busy], radius[busy], sigma_px, kind)
+        j[:, 3] = value
         if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
-            theta = _solve(jac[:, 3:], weight, data)
-        depth = theta[:, :1]
-        jac[:, 0], jac[:, 1], jac[:, 2] = -depth * dx, -depth * dy, depth * slope_r
-        model = np.matmul(theta[:, None], jac[:, 3:])[:, 0]
-        if step in (2, 5):  # the variance follows the expected value once the model is near
-            weight = valid / noise.variance_at(model if added is None else model + added)
-        delta = _solve(jac, weight, data - model, damping=1e-6)
+            theta = _solve(j[:, 3:], now, seen).astype(kind)
+        depth = theta[busy, :1]
+        j[:, 0], j[:, 1], j[:, 2] = -depth * dx, -depth * dy, depth * slope_r
+        model = np.matmul(theta[busy, None], j[:, 3:])[:, 0]
+        if step in _REWEIGHTED:  # the variance follows the expected value once the model is near
+            now = weight[busy] = valid[busy] / noise.variance_at(model + added[busy]).astype(kind)
+        delta = _solve(j, now, seen - model, damping=1e-6)
         scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(delta[:, :3]).max(1), 1e-12))[:, None]
-        local = np.clip(local + scale * delta[:, :2], 1.0, size - 2.0)
-        radius = np.clip(radius + (scale * delta[:, 2:3])[:, 0], low, high)
-        theta = theta + scale * delta[:, 3:]
-        converged = np.abs(delta[:, :2]).max(1) < _CONVERGED_PX * 10
-        if (np.abs(delta[:, :3]) < _CONVERGED_PX).all():
+        local[busy] = np.clip(local[busy] + scale * delta[:, :2], 1.0, size - 2.0)
+        radius[busy] = np.clip(radius[busy] + (scale * delta[:, 2:3])[:, 0], low, high)
+        theta[busy] += (scale * delta[:, 3:]).astype(kind)
+        converged[busy] = np.abs(delta[:, :2]).max(1) < _CONVERGED_PX * 10
+        moving = (np.abs(delta[:, :3]) >= _CONVERGED_PX).any(1)
+        if not moving.any():
             break
-    value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px)
+        if step >= _REWEIGHTED[-1]:
+            busy = busy[moving]
+    value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px, kind)
     jac[:, 3] = value
-    theta = _solve(jac[:, 3:], weight, data)
+    # the rest is added to what is known: no digits are lost in it
+    theta = theta + _solve(jac[:, 3:], weight, data - np.matmul(theta[:, None], jac[:, 3:])[:, 0]).astype(kind)
     depth = theta[:, :1]
     jac[:, 0], jac[:, 1], jac[:, 2] = -depth * dx, -depth * dy, depth * slope_r
     residual = data - np.matmul(theta[:, None], jac[:, 3:])[:, 0]
-    weighted = jac * np.sqrt(weight)[:, None]
+    weighted = jac * np.sqrt(weight, dtype=np.float64)[:, None]
     covariance = np.linalg.pinv(np.matmul(weighted, weighted.transpose(0, 2, 1)), hermitian=True)[:, :4]
     if not quick:
         influence = np.matmul(covariance, weighted).reshape(n, 4, size, size)
         covariance = np.stack([influence_covariance(one, noise.correlation) for one in influence])
-    distance = np.hypot(grid_c - local[:, :1], grid_r - local[:, 1:])
-    core = distance < (radius + sigma_px)[:, None]
+    core = _distance(grid_c - local[:, :1], grid_r - local[:, 1:]) < (radius + sigma_px)[:, None]
     square = weight * residual**2
     core_n = np.maximum((core * valid).sum(1), 1.0)
     chi2_core = (square * core).sum(1) / core_n
@@ -218,7 +228,7 @@ def _fit_batch(
     return BallFits(
         position_px=local + patches.corner_px,
         radius_px=radius,
-        depth=theta[:, 0],
+        depth=theta[:, 0].astype(np.float64),
         covariance=covariance[:, :, :4],
         chi2_core=chi2_core,
         chi2_ring=chi2_ring,
@@ -227,7 +237,7 @@ def _fit_batch(
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
         window_fraction=valid.mean(1),
         log_likelihood=-0.5 * square.sum(1),
-        background=theta[:, 1],
+        background=theta[:, 1] + level[:, 0],
         converged=converged,
     )
 
@@ -255,18 +265,23 @@ def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) 
     return out
 
 
+def _distance(dx: Float, dy: Float) -> Float:
+    return np.asarray(np.sqrt(dx * dx + dy * dy))  # a fifth of the time of hypot, which minds overflow
+
+
 def _ball(
-    table: BallTable, grid_c: Float, grid_r: Float, local: Float, radius: Float, sigma_px: float
+    table: BallTable, grid_c: Float, grid_r: Float, local: Float, radius: Float, sigma_px: float, kind: Any
 ) -> tuple[Float, Float, Float, Float]:
-    dx, dy = grid_c - local[:, :1], grid_r - local[:, 1:]
-    rho = np.hypot(dx, dy)
-    value, slope, slope_r = table.evaluate(rho / sigma_px, radius / sigma_px)
-    slope = slope / (sigma_px * np.maximum(rho, 1e-9))
-    return value, slope * dx, slope * dy, slope_r / sigma_px
+    dx, dy = (grid_c - local[:, :1]).astype(kind), (grid_r - local[:, 1:]).astype(kind)
+    rho = _distance(dx, dy)
+    value, slope, slope_r = table.evaluate(rho / kind(sigma_px), radius / sigma_px)
+    slope /= kind(sigma_px) * np.maximum(rho, kind(1e-9))
+    return value, slope * dx, slope * dy, slope_r / kind(sigma_px)
 
 
 def _solve(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
-    root = np.sqrt(weight)
+    # products are added up in double precision: radius and depth of a ball that is small against the blur can all but stand for each other
+    root = np.sqrt(weight, dtype=np.float64)
     weighted = jac * root[:, None]
     normal = np.matmul(weighted, weighted.transpose(0, 2, 1))
     right = np.matmul(weighted, (root * target)[:, :, None])[:, :, 0]

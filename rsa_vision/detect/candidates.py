@@ -55,6 +55,11 @@ class Candidates:
     junctions: Float
     strokes: Float
 
+    def rows(self, index: Any) -> Candidates:
+        """Return the extrema that ``index`` selects, with all junctions and strokes."""
+        chosen = (self.position_px[index], self.radius_px[index], self.strength[index], self.roundness[index])
+        return Candidates(*chosen, self.junctions, self.strokes)
+
 
 def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> Candidates:
     """Find local extrema of the multi-scale filter.
@@ -100,10 +105,13 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
         image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
     out = [np.zeros((0, 5))]
     junctions, strokes = np.zeros((0, 5)), [np.zeros((0, COLUMNS))]
+    last: tuple[tuple[int, float], NDArray[Any]] | None = None
     for level, inner, outer, radius in SCALES:
         source = level_images[level]
         # outer minus inner: positive where the mark is darker than its surroundings
-        answer = cv2.GaussianBlur(source, (0, 0), outer) - cv2.GaussianBlur(source, (0, 0), inner)
+        begun = last[1] if last and last[0] == (level, inner) else cv2.GaussianBlur(source, (0, 0), inner)
+        last = (level, outer), cv2.GaussianBlur(source, (0, 0), outer)  # the next scale may begin with it
+        answer = cv2.subtract(last[1], begun, dst=begun)
         limit = threshold * cv2.resize(
             _local_spread(answer, _white_spread(noise, level, inner, outer)),
             (answer.shape[1], answer.shape[0]),
@@ -118,12 +126,14 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
 
 
 def _extrema(answer: NDArray[Any], limit: NDArray[Any], level: int, radius: float, threshold: float) -> Float:
-    high = cv2.dilate(answer, np.ones((3, 3), np.uint8))
-    low = cv2.erode(answer, np.ones((3, 3), np.uint8))
-    peak = ((answer == high) & (answer > limit)) | ((answer == low) & (answer < -limit))
-    peak[0] = peak[-1] = False
-    peak[:, 0] = peak[:, -1] = False
-    row, col = np.nonzero(peak)
+    row, col = np.divmod(np.flatnonzero((answer > limit) | (answer < -limit)), answer.shape[1])
+    whole = (row > 0) & (row < answer.shape[0] - 1) & (col > 0) & (col < answer.shape[1] - 1)
+    row, col = row[whole], col[whole]
+    # few pixels answer: to look around those costs less than filters of rank over all
+    for dr, dc in ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+        here = answer[row, col]
+        peak = np.copysign(1, here) * (here - answer[row + dr, col + dc]) >= 0
+        row, col = row[peak], col[peak]
     if len(row) == 0:
         return np.zeros((0, 5))
     centre = answer[row, col].astype(np.float64)

@@ -122,7 +122,7 @@ def explained_over_noise(fits: BallFits) -> Float:
 
 
 def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) -> BallFits:
-    """Fit every round candidate with guessed optics and keep what may be a ball.
+    """Fit every candidate with guessed optics and keep what may be a ball.
 
     Parameters
     ----------
@@ -133,16 +133,13 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
     Returns
     -------
     BallFits
-        Best first; no two nearer than a radius.
+        In the order of the candidates; several may have come to the same place.
     """
-    round_ones = candidates.roundness > ROUNDNESS
-    position, radius = candidates.position_px[round_ones], candidates.radius_px[round_ones]
-    if len(position) == 0:
+    if len(candidates.radius_px) == 0:
         return _no_fits()
     guess = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
-    fits = fit_at(film, position, radius, guess, noise, quick=True)
-    fits = fits.rows(plausible(fits, noise, slack=2.5))
-    return distinct(fits, noise)
+    fits = fit_at(film, candidates.position_px, candidates.radius_px, guess, noise, quick=True)
+    return fits.rows(plausible(fits, noise, slack=2.5))
 
 
 def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:

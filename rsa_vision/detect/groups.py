@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,71 +54,36 @@ def fit_group(
         One row a ball; figures of merit are taken under the ball, with all balls modelled.
     """
     k = len(start_px)
-    middle = start_px.mean(0)
-    spread = float(np.abs(start_px - middle).max())
-    half = half_size(float(start_radius_px.max()), sigma_px) + int(np.ceil(spread))
-    patch = cut(film, middle[None], half, noise)
-    corner = patch.corner_px[0].astype(np.float64)
-    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size].reshape(2, -1).astype(np.float64)
-    valid = patch.valid[0].ravel().astype(np.float64)
-    raw = patch.values[0].ravel()
-    neighbours = np.zeros_like(raw) if others is None else others(cols + corner[0], rows + corner[1])
-    data = raw - neighbours
-    local, radius = start_px - corner, np.clip(start_radius_px, RADIUS_PX[0], RADIUS_PX[1]).astype(np.float64)
+    window = _window(film, start_px, start_radius_px, sigma_px, noise, others)
+    size, cols, rows, valid, data = window.size, window.cols, window.rows, window.valid, window.raw - window.neighbours
+    local, radius = start_px - window.corner_px, np.clip(start_radius_px, RADIUS_PX[0], RADIUS_PX[1]).astype(np.float64)
     low, high = max(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20 * sigma_px)
-    surface = polynomial(half, cols - half, rows - half)
-    table = ball_table(round(mu_px * sigma_px, 3))
-    weight = valid / noise.variance_at(raw)
-
-    def model() -> tuple[Float, Float, Float, Float]:
-        dx, dy = cols - local[:, :1], rows - local[:, 1:]
-        rho = np.hypot(dx, dy)
-        value, slope, slope_r = table.evaluate(rho / sigma_px, radius / sigma_px)
-        slope = slope / (sigma_px * np.maximum(rho, 1e-9))
-        return value, -slope * dx, -slope * dy, slope_r / sigma_px
-
-    def linear_part(value: Float) -> tuple[Float, list[tuple[int, int]], list[Float]]:
-        # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
-        pairs: list[tuple[int, int]] = []
-        products: list[Float] = []
-        slopes: list[Float] = []
-        for pair in lapping(local, radius):
-            product, by = product_image(local[list(pair)], radius[list(pair)], sigma_px, mu_px, patch.size)
-            if product.max() > LEAST:
-                pairs, products, slopes = [*pairs, pair], [*products, product[None]], [*slopes, by]
-        return columns([value, surface.T, *products]), pairs, slopes
-
-    value, d_col, d_row, d_radius = model()
-    linear, pairs, slopes = linear_part(value)
-    theta = weighted_least_squares(linear, weight, data, 1e-6)
+    surface = window.surface
+    weight = valid / noise.variance_at(window.raw)
+    images = _images(window, surface, local, radius, sigma_px, mu_px)
+    theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     if edge:
-        bare = (data - value.T @ theta[:k]).reshape(patch.size, patch.size)
-        surface = np.column_stack([surface, edge_profile(bare, valid.reshape(bare.shape), sigma_px)])
-        linear, pairs, slopes = linear_part(value)
-        theta = weighted_least_squares(linear, weight, data, 1e-6)
+        surface = np.column_stack([surface, edge_profile(data - images.value.T @ theta[:k], valid, sigma_px)])
+        images = _images(window, surface, local, radius, sigma_px, mu_px)
+        theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     converged = False
     for step in range(_STEPS + 1):
-        depth = theta[:k, None]
-        by_shape = depth * np.stack([d_col, d_row, d_radius])
-        for of_product, pair, by in zip(theta[linear.shape[1] - len(pairs) :], pairs, slopes, strict=True):
-            by_shape[:, list(pair)] += of_product * by.transpose(1, 0, 2)
-        jac = columns([by_shape.reshape(3 * k, -1), linear.T])
+        value, linear, jac = images.value, images.linear, images.jacobian(theta)
         residual = data - linear @ theta
         if step == _STEPS or converged:
             break
         if step in (4, 10):
-            weight = valid / noise.variance_at(linear @ theta + neighbours)
+            weight = valid / noise.variance_at(linear @ theta + window.neighbours)
         delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 6 else 1e-7)
         move = delta[: 3 * k].reshape(3, k)
         scale = min(1.0, 0.5 / max(float(np.abs(move).max()), 1e-9))
         local = local + scale * move[:2].T
         radius = np.clip(radius + scale * move[2], low, high)
         converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
-        value, d_col, d_row, d_radius = model()
-        linear, pairs, slopes = linear_part(value)
-        theta = weighted_least_squares(linear, weight, data, 1e-9)
+        images = _images(window, surface, local, radius, sigma_px, mu_px)
+        theta = weighted_least_squares(images.linear, weight, data, 1e-9)
     covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
-    influence = (covariance[: 4 * k] @ (jac * np.sqrt(weight)[:, None]).T).reshape(4 * k, patch.size, patch.size)
+    influence = (covariance[: 4 * k] @ (jac * np.sqrt(weight)[:, None]).T).reshape(4 * k, size, size)
     whole = influence_covariance(influence, noise.correlation)
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
     core = distance < (radius + sigma_px)[:, None]
@@ -126,15 +93,13 @@ def fit_group(
     raised = weight * (residual + theta[:k, None] * value) ** 2
     own = [[i, k + i, 2 * k + i, 3 * k + i] for i in range(k)]
     return BallFits(
-        position_px=local + corner,
+        position_px=local + window.corner_px,
         radius_px=radius,
         depth=theta[:k],
         covariance=np.stack([whole[np.ix_(index, index)] for index in own]),
         chi2_core=(square * core).sum(1) / inside,
-        chi2_ring=uneven(
-            np.broadcast_to(residual, distance.shape), np.broadcast_to(weight * ring, distance.shape), local, patch.size, ~core
-        ),
-        chi2_uneven=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight, distance.shape), local, patch.size, core),
+        chi2_ring=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight * ring, distance.shape), local, size, ~core),
+        chi2_uneven=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight, distance.shape), local, size, core),
         explained=1 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
         window_fraction=np.full(k, valid.mean()),
@@ -142,6 +107,100 @@ def fit_group(
         background=np.full(k, theta[k]),
         converged=np.full(k, converged),
     )
+
+
+def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None) -> float:
+    """Return twice the log-likelihood that an edge in the background would gain, to first order (the score test of Rao, 1948).
+
+    No fit is needed for it: what is left of the window by balls that were fitted without an edge says how far one more step would get with
+    an edge and without.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    fits : BallFits
+        One group, as fitted without an edge.
+    sigma_px, mu_px : float
+    noise : NoiseModel
+    others : callable, optional
+        As of :func:`fit_group`.
+
+    Returns
+    -------
+    float
+        As if the noise were white.
+    """
+    window = _window(film, fits.position_px, fits.radius_px, sigma_px, noise, others)
+    weight = window.valid / noise.variance_at(window.raw)
+    data = window.raw - window.neighbours
+    images = _images(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, sigma_px, mu_px)
+    theta = weighted_least_squares(images.linear, weight, data)
+    edge = edge_profile(data - images.value.T @ theta[: len(fits.depth)], window.valid, sigma_px)
+    residual, jac = data - images.linear @ theta, columns([images.jacobian(theta).T, edge.T])
+    explained = [(weight * residual) @ part @ weighted_least_squares(part, weight, residual) for part in (jac, jac[:, : -edge.shape[1]])]
+    return float(explained[0] - explained[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    """The pixels around a group, in one row each: (n,) unless said otherwise."""
+
+    size: int
+    corner_px: Float  # (col, row) on the film
+    cols: Float  # in the window, as rows
+    rows: Float
+    raw: Float
+    neighbours: Float
+    valid: Float
+    surface: Float  # (n, 6)
+
+
+def _window(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: float, noise: NoiseModel, others: Any) -> _Window:
+    middle = at_px.mean(0)
+    half = half_size(float(radius_px.max()), sigma_px) + int(np.ceil(float(np.abs(at_px - middle).max())))
+    patch = cut(film, middle[None], half, noise)
+    corner = patch.corner_px[0].astype(np.float64)
+    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size].reshape(2, -1).astype(np.float64)
+    raw = patch.values[0].ravel()
+    neighbours = np.zeros_like(raw) if others is None else others(cols + corner[0], rows + corner[1])
+    valid = patch.valid[0].ravel().astype(np.float64)
+    return _Window(patch.size, corner, cols, rows, raw, neighbours, valid, polynomial(half, cols - half, rows - half))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Images:
+    """What balls at given places look like in a window, with all that enters it linearly."""
+
+    value: Float  # (k, n)
+    slopes: Float  # (3, k, n), of each ball by its col, row and radius
+    linear: Float  # (n, p): balls, background, products of two
+    pairs: list[tuple[int, int]]
+    of_pairs: list[Float]  # slopes of the products
+
+    def jacobian(self, theta: Float) -> Float:
+        """Return the derivatives by all cols, rows and radii, then by the linear parameters; shape (n, 3 k + p)."""
+        k = len(self.value)
+        by_shape = theta[:k, None] * self.slopes
+        for of_product, pair, by in zip(theta[len(theta) - len(self.pairs) :], self.pairs, self.of_pairs, strict=True):
+            by_shape[:, list(pair)] += of_product * by.transpose(1, 0, 2)
+        return columns([by_shape.reshape(3 * k, -1), self.linear.T])
+
+
+def _images(window: _Window, surface: Float, local: Float, radius: Float, sigma_px: float, mu_px: float) -> _Images:
+    dx, dy = window.cols - local[:, :1], window.rows - local[:, 1:]
+    rho = np.hypot(dx, dy)
+    value, slope, slope_r = ball_table(round(mu_px * sigma_px, 3)).evaluate(rho / sigma_px, radius / sigma_px)
+    slope = slope / (sigma_px * np.maximum(rho, 1e-9))
+    # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
+    pairs: list[tuple[int, int]] = []
+    products: list[Float] = []
+    of_pairs: list[Float] = []
+    for pair in lapping(local, radius):
+        product, by = product_image(local[list(pair)], radius[list(pair)], sigma_px, mu_px, window.size)
+        if product.max() > LEAST:
+            pairs, products, of_pairs = [*pairs, pair], [*products, product[None]], [*of_pairs, by]
+    linear = columns([value, surface.T, *products])
+    return _Images(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, pairs, of_pairs)
 
 
 def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
@@ -152,9 +211,9 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
 
     Parameters
     ----------
-    bare : ndarray of shape (s, s)
+    bare : ndarray of shape (s * s,)
         The window without its balls.
-    valid : ndarray of shape (s, s)
+    valid : ndarray of shape (s * s,)
         1, or 0 where masked.
     sigma_px : float
         Blur of the film: nothing changes faster.
@@ -164,16 +223,23 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
     ndarray of shape (s * s, p)
         Cubic B-splines of the coordinate across the edge.
     """
+    size = math.isqrt(len(bare))
+    bare, valid = bare.reshape(size, size), valid.reshape(size, size)
     weight = gaussian_filter(valid, 1.0)
     smooth = gaussian_filter(bare * valid, 1.0) / np.maximum(weight, 1e-6)
     by_row, by_col = np.gradient(smooth)
     inside = valid * (weight > 0.9)
     tensor = np.array([[(inside * a * b).sum() for b in (by_col, by_row)] for a in (by_col, by_row)])
     across = np.linalg.eigh(tensor)[1][:, 1]
-    rows, cols = np.mgrid[0 : len(bare), 0 : len(bare)] - (len(bare) - 1) / 2
-    t = (cols * across[0] + rows * across[1]).ravel()
+    steps = np.arange(size) - (size - 1) / 2
+    t = (steps * across[0] + (steps * across[1])[:, None]).ravel()
     step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
-    distance = np.abs(t[:, None] - np.arange(t.min(), t.max() + step, step)) / step
-    near, far = 2 / 3 - distance**2 + distance**3 / 2, np.maximum(2 - distance, 0) ** 3 / 6
-    splines: Float = np.where(distance < 1, near, far)
-    return splines
+    place = (t - t.min()) / step
+    knot = place.astype(np.intp)
+    part = place - knot
+    # a spline reaches two knots to either side; those centred off the window are left out
+    splines = np.zeros((int(knot.max()) + 4, len(t)))
+    of_four = ((1 - part) ** 3 / 6, 2 / 3 - part**2 + part**3 / 2, 2 / 3 - (1 - part) ** 2 + (1 - part) ** 3 / 2, part**3 / 6)
+    for k, basis in enumerate(of_four):
+        splines[knot + k, np.arange(len(t))] = basis
+    return splines[1 : int(np.ceil(place.max() - 1e-9)) + 2].T

@@ -19,6 +19,7 @@ RINGS_PX = (6.0, 9.0, 13.0, 19.0)  # film pixels; a tee shows on the rings that 
 DIRECTIONS = 24
 LEAST = 1.5  # score, in units of what counts as significant
 _CHUNK = 8192  # points whose rings fit into the cache
+_APART = 4  # pixels of the answer; of junctions nearer than this, the best
 _GAP = 0.5  # between the arms the answer may reach this part of the weakest arm
 
 
@@ -40,44 +41,57 @@ def find_junctions(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Flo
         col_px, row_px, angle of the stem (radians, counter-clockwise as displayed), ring radius in film pixels, strength (score in units of
         ``limit``); negative strength for bright marks.
     """
-    found = [_one_polarity(answer, limit, level), _one_polarity(-answer, limit, level)]
-    found[1][:, 4] *= -1
+    margin = int(RINGS_PX[-1] / 2**level) + 1
+    scaled = cv2.copyMakeBorder(cv2.divide(answer, limit), margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+    found = [_one_polarity(scaled, sign, margin, level) for sign in (1, -1)]
     return np.concatenate(found)
 
 
-def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Float:
+def _one_polarity(scaled: NDArray[Any], sign: int, margin: int, level: int) -> Float:
     size = 2**level
-    strong = (answer > limit).astype(np.uint8)
+    inside = scaled[margin:-margin, margin:-margin]
+    strong = (inside > 1 if sign > 0 else inside < -1).astype(np.uint8)
     if not strong.any():
         return np.zeros((0, 5))
     # the tips fade out, so the centre itself may answer weakly: look a little around what answers
-    row, col = np.nonzero(cv2.dilate(strong, np.ones((5, 5), np.uint8)))
+    row, col = np.divmod(np.flatnonzero(cv2.dilate(strong, np.ones((5, 5), np.uint8)) > 0), strong.shape[1])
     theta = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     quarter, eighth = DIRECTIONS // 4, DIRECTIONS // 8
-    margin = int(RINGS_PX[-1] / size) + 1
-    scaled = np.pad(np.divide(answer, limit, dtype=np.float32), margin, mode="edge")
-    best = np.zeros(answer.shape, np.float32)
-    angle, ring = np.zeros(answer.shape, np.float32), np.zeros(answer.shape, np.float32)
+    best, angle, ring = np.zeros((3, len(row)), np.float32)
     around_c, around_r = (np.rint(np.outer(RINGS_PX, way) / size).astype(np.intp) for way in (np.cos(theta), -np.sin(theta)))
     for radius, offset in zip(RINGS_PX, around_r * scaled.shape[1] + around_c, strict=True):
         for begin in range(0, len(row), _CHUNK):
-            r, c = row[begin : begin + _CHUNK], col[begin : begin + _CHUNK]
-            samples = scaled.ravel().take((r + margin) * scaled.shape[1] + c + margin + offset[:, None])
-            beside = _turned(samples)
-            near = _turned(np.maximum(beside(1), np.maximum(samples, beside(-1))))
+            point = np.arange(begin, min(begin + _CHUNK, len(row)))
+            samples = scaled.ravel().take((row[point] + margin) * scaled.shape[1] + col[point] + margin + offset[:, None])
+            # three arms that are strong enough: most points can be left out before their scores are formed
+            arm = _turned(_widened(samples > LEAST if sign > 0 else samples < -LEAST))
+            worth = (arm(0) & arm(quarter) & arm(-quarter)).any(0)
+            point, samples = point[worth], sign * samples[:, worth]
+            if len(point) == 0:
+                continue
+            beside, near = _turned(samples), _turned(_widened(samples))
             arms = np.minimum(near(0), np.minimum(near(quarter), near(-quarter)))
             gaps = beside(2 * quarter)  # opposite to the stem
             for turn in (eighth, -eighth, quarter + eighth, -quarter - eighth):
                 gaps = np.maximum(gaps, beside(turn))
             score = np.where(gaps < _GAP * arms, arms - np.maximum(gaps, 0), 0)
             k = score.argmax(0)
-            value = score[k, np.arange(len(r))]
-            better = value > best[r, c]
-            r, c, k = r[better], c[better], k[better]
-            best[r, c], angle[r, c], ring[r, c] = value[better], theta[k], radius
-    peak = (best > LEAST) & (best == cv2.dilate(best, np.ones((9, 9), np.uint8)))
-    r, c = np.nonzero(peak)
-    return np.stack([(c + 0.5) * size - 0.5, (r + 0.5) * size - 0.5, angle[r, c], ring[r, c], best[r, c]], axis=1).astype(np.float64)
+            value = score[k, np.arange(len(k))]
+            better = value > best[point]
+            best[point[better]], angle[point[better]], ring[point[better]] = value[better], theta[k[better]], radius
+    row, col, angle, ring, best = (v[best > LEAST] for v in (row, col, angle, ring, best))
+    around = np.zeros([n + 2 * _APART for n in strong.shape], np.float32)
+    around[row + _APART, col + _APART] = best
+    windows = np.lib.stride_tricks.sliding_window_view(around, (2 * _APART + 1,) * 2)
+    peak = best == windows[row, col].max((1, 2), initial=0.0)
+    table = np.stack([(col + 0.5) * size - 0.5, (row + 0.5) * size - 0.5, angle, ring, sign * best], axis=1)
+    return np.asarray(table[peak], np.float64)
+
+
+def _widened(samples: NDArray[Any]) -> NDArray[Any]:
+    """Return the largest of each direction and the two beside it."""
+    beside = _turned(samples)
+    return np.asarray(np.maximum(beside(1), np.maximum(samples, beside(-1))))
 
 
 def _turned(samples: NDArray[Any]) -> Callable[[int], NDArray[Any]]:

@@ -75,15 +75,16 @@ class BallTable:
         value, d_rho, d_radius : ndarrays of the shape of ``x``
         """
         _, ny, nx = self.nodes.shape
+        kind = x.dtype
         row = np.clip((np.log(y) - np.log(_Y_MIN)) / _Y_STEP, 0, ny - 1.001)
         top = row.astype(np.intp)
         frac = (row - top)[:, None]
         # one blended row for every ball, then a look-up along rho only: half the work of a two-dimensional look-up for each pixel
-        col = np.minimum(x / _X_STEP, nx - 1.001)
+        col = np.minimum(x * kind.type(1 / _X_STEP), kind.type(nx - 1.001))
         left = col.astype(np.intp)
-        part = col - left
+        part = col - left.astype(kind)
         reach = int(left.max(initial=0)) + 2
-        line = (self.nodes[:, top, :reach] * (1 - frac) + self.nodes[:, top + 1, :reach] * frac).reshape(3, -1)
+        line = (self.nodes[:, top, :reach] * (1 - frac) + self.nodes[:, top + 1, :reach] * frac).reshape(3, -1).astype(kind)
         index = left + (np.arange(len(y)) * reach).reshape((-1,) + (1,) * (x.ndim - 1))
         low = line.take(index, axis=1)
         value, d_rho, d_radius = low + part * (line.take(index + 1, axis=1) - low)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rsa_vision.detect.balls import BallFits, ball_image, join
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible
-from rsa_vision.detect.groups import fit_group
+from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
@@ -27,6 +27,7 @@ TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the f
 _MOST_IN_GROUP = 5
 DOUBTFUL = 0.6  # of the misfit that a ball may leave: more may be two balls
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
+_FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
 _LEAST_KNOWN = 3  # balls that tell what one of them looks like on this film
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _LIKE = 0.35  # logarithm of the radius, against the film's median
@@ -114,10 +115,15 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
         index = np.array(g)
         beside = _beside(fits, index, optics, tees)
         plain = fits.rows(index)
-        if len(g) > _MOST_IN_GROUP:
+        # a size at the limit is not fitted: nothing that comes to rest there is a ball
+        if len(g) > _MOST_IN_GROUP or (plain.radius_px >= RADIUS_PX[1]).any():
             parts.append(plain)
             continue
         start, radius = plain.position_px, plain.radius_px
+        foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside) / noise.correlation.sum()
+        if foreseen < _FORESEEN * EDGE_GAIN:
+            parts.append(plain)
+            continue
         flat = fit_group(film, start, radius, optics.sigma_px, optics.mu_px, noise, beside)
         edged = fit_group(film, start, radius, optics.sigma_px, optics.mu_px, noise, beside, edge=True)
         gain = 2 * (edged.log_likelihood[0] - flat.log_likelihood[0]) / noise.correlation.sum()

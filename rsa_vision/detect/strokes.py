@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.types import Float
 
@@ -17,6 +18,7 @@ LEAST_PEAK = 2.0  # of an island, in units of what counts as significant
 SLIM = 1.5  # ratio of an island's length to its width
 LENGTHS_PX = (4.0, 130.0)  # film pixels; needles and wires are longer
 COLUMNS = 6
+_LEAST_AREA = 4  # pixels of the answer
 
 
 def find_strokes(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Float:
@@ -37,37 +39,63 @@ def find_strokes(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Float
         col_px, row_px of the middle, angle of the axis (radians, counter-clockwise as displayed), length and width in film pixels, strength
         (largest answer in units of ``limit``); negative strength for bright marks.
     """
-    found = [_one_polarity(answer, limit, level), _one_polarity(-answer, limit, level)]
-    found[1][:, 5] *= -1
+    found = [_one_polarity(answer, limit, level, sign) for sign in (1, -1)]
     return np.concatenate(found)
 
 
-def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Float:
+def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int, sign: int) -> Float:
     size = 2**level
-    _, labels, stats, _ = cv2.connectedComponentsWithStats((answer > limit).astype(np.uint8))
-    side = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * size
-    wanted = (side > LENGTHS_PX[0] / 2) & (side < LENGTHS_PX[1]) & (stats[:, cv2.CC_STAT_AREA] >= 4)
-    wanted[0] = False
+    place = np.flatnonzero(answer > limit if sign > 0 else answer < -limit)
+    if len(place) == 0:
+        return np.zeros((0, COLUMNS))
+    r, c = np.divmod(place, answer.shape[1])
+    island = _islands(r, c)
+    weight = sign * answer.ravel()[place].astype(np.float64)
+    strength = np.zeros(island.max() + 1)
+    np.maximum.at(strength, island, weight / limit.ravel()[place])
+    wanted = (strength > LEAST_PEAK) & (np.bincount(island) >= _LEAST_AREA)
     if not wanted.any():
         return np.zeros((0, COLUMNS))
-    place = np.flatnonzero(wanted[labels])
-    r, c = np.divmod(place, answer.shape[1])
-    island = (np.cumsum(wanted) - 1)[labels.ravel()[place]]
-    weight = answer.ravel()[place].astype(np.float64)
-    strength = np.zeros(wanted.sum())
-    np.maximum.at(strength, island, weight / limit.ravel()[place])
+    mine = wanted[island]
+    r, c, weight, island, strength = r[mine], c[mine], weight[mine], (np.cumsum(wanted) - 1)[island[mine]], strength[wanted]
 
     def mean(values: Float) -> Float:
         total: Float = np.bincount(island, weight * values) / np.bincount(island, weight)
         return total
 
+    def extent(values: NDArray[np.intp]) -> NDArray[np.intp]:
+        low, high = np.full(len(strength), values.max()), np.full(len(strength), values.min())
+        np.minimum.at(low, island, values)
+        np.maximum.at(high, island, values)
+        return np.asarray(high - low + 1)
+
+    side = np.maximum(extent(r), extent(c)) * size
     x, y = mean(c.astype(np.float64)), mean(r.astype(np.float64))
     dx, dy = c - x[island], y[island] - r
     xx, yy, xy = mean(dx * dx) + 1 / 12, mean(dy * dy) + 1 / 12, mean(dx * dy)
     middle, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     length, width = (np.sqrt(12 * np.maximum(m, 0.0)) * size for m in (middle + apart, middle - apart))
     rows: Float = np.stack(
-        [(x + 0.5) * size - 0.5, (y + 0.5) * size - 0.5, 0.5 * np.arctan2(2 * xy, xx - yy), length, width, strength], axis=1
+        [(x + 0.5) * size - 0.5, (y + 0.5) * size - 0.5, 0.5 * np.arctan2(2 * xy, xx - yy), length, width, sign * strength], axis=1
     )
-    slim: Float = rows[(strength > LEAST_PEAK) & (length > SLIM * width) & (length > LENGTHS_PX[0]) & (length < LENGTHS_PX[1])]
+    seen = (side > LENGTHS_PX[0] / 2) & (side < LENGTHS_PX[1])
+    slim: Float = rows[seen & (length > SLIM * width) & (length > LENGTHS_PX[0]) & (length < LENGTHS_PX[1])]
     return slim
+
+
+def _islands(r: NDArray[np.intp], c: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return which island each pixel belongs to, from their rows and columns in the order of a film; pixels touch by sides and corners.
+
+    Few pixels answer, so runs along the rows are joined instead of labelling all pixels of the film.
+    """
+    width = int(c.max()) + 3  # a gap between the end of one row and the start of the next
+    flat = r * width + c
+    begins = np.flatnonzero(np.diff(flat, prepend=-2) != 1)
+    first, last = flat[begins], flat[np.append(begins[1:], len(flat)) - 1]
+    low, high = np.searchsorted(last, first + width - 1), np.searchsorted(first, last + width + 1, side="right")
+    n = np.maximum(high - low, 0)
+    upper = np.repeat(np.arange(len(first)), n)
+    lower = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n) + np.repeat(low, n)
+    touching = csr_array((np.ones(len(upper), np.int8), (upper, lower)), shape=(len(first), len(first)))
+    island = connected_components(touching, directed=False)[1]
+    return np.asarray(np.repeat(island, np.diff(np.append(begins, len(flat)))), np.intp)
