@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from rsa_vision.detect.balls import polynomial
 from rsa_vision.detect.crossing import between, gain_at, lapping, scored
@@ -32,6 +32,7 @@ _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the need
 _TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
 _SHARED = 3  # attenuation, blur, taper
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
+_SETTLED = 0.1  # conditional standard deviations of all that is common
 _MUCH = 0.15  # of the logarithms, from which derivatives by them are taken anew
 _MOST_BY_STEP = 0.6  # of all these
 _SLANT, _SKEW = 0.2, 0.1  # expected sizes: rays cross a film at slopes of up to a half
@@ -57,12 +58,12 @@ class _Window:
     size: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Equations:
-    """Linearised fit of the needles of a window; rows weighted to a variance of one, those of priors last.
+    """Linearised fit of the needles of a window, by needles' own parameters and by the common ones.
 
-    ``basis``, ``triangle``: of the columns of the own parameters, in units of ``scale``; ``common``: what of the columns of the common
-    ones the own ones cannot stand for.
+    ``own`` (n, p), ``common`` (n, c) and ``residual`` (n,) are weighted to a variance of one; ``own`` in units of ``scale``. ``prior`` (p,)
+    is one over what an own parameter is expected to be, ``known`` (p,) how much of that it is off.
     """
 
     members: list[NeedleFit]
@@ -70,23 +71,43 @@ class _Equations:
     weight: Float
     left: Float
     background: float
-    residual: Float
-    basis: Float
-    triangle: Float
-    scale: Float
-    by_common: Float
+    own: Float
     common: Float
+    residual: Float
+    scale: Float
+    prior: Float
+    known: Float
     parallel: bool
 
-    def own(self, target: Float) -> Float:
-        """Own parameters that explain a target (n,) or (n, m), shape (p,) or (p, m)."""
-        return np.asarray((solve_triangular(self.triangle, self.basis.T @ target).T / self.scale).T)
+    @cached_property
+    def inverse(self) -> Float:
+        """Inverse of the normal matrix of the own parameters, in units of their scale."""
+        normal = self.own.T @ self.own + np.diag(self.prior**2 + _RIDGE**2)
+        return np.asarray(np.linalg.inv(normal), np.float64)
 
-    @property
-    def sharpest_px(self) -> float:
-        """Least standard deviation of a tip's coordinate."""
-        rows = solve_triangular(self.triangle, np.eye(len(self.scale)))[self.tips] / self.scale[self.tips, None]
-        return float(np.linalg.norm(rows, axis=1).min())
+    def to_own(self, target: Float) -> Float:
+        """Own parameters, in units of their scale, that explain a target (n,) or (n, m)."""
+        explained: Float = self.inverse @ (self.own.T @ target)
+        return explained
+
+    @cached_property
+    def own_by_common(self) -> Float:
+        """What of the own parameters a change of the common ones takes along, shape (p, c), negative."""
+        return self.to_own(self.common)
+
+    def information(self) -> tuple[Float, Float]:
+        """Normal matrix (c, c) and right-hand side (c,) of the common parameters, the own ones eliminated, their priors counted."""
+        by_own = self.common.T @ self.own
+        step = self.inverse @ (self.own.T @ self.residual + self.prior * self.known)
+        excess = self.excess
+        return (self.common.T @ self.common - by_own @ self.own_by_common) / excess, (
+            self.common.T @ self.residual - by_own @ step
+        ) / excess
+
+    def step(self, change: Float) -> Float:
+        """Change of the own parameters, shape (p,), that goes with one of the common ones."""
+        scaled: Float = self.inverse @ (self.own.T @ self.residual + self.prior * self.known) - self.own_by_common @ change
+        return scaled / self.scale
 
     @property
     def tips(self) -> Int:
@@ -95,9 +116,14 @@ class _Equations:
         return np.add.outer(each * np.arange(len(self.members)), [0, 1]).ravel()
 
     @property
+    def sharpest_px(self) -> float:
+        """Least standard deviation of a tip's coordinate."""
+        return float((np.sqrt(self.inverse.diagonal()) / self.scale)[self.tips].min())
+
+    @property
     def excess(self) -> float:
-        """Chi2 under the arms over what noise leaves, at least one."""
-        return max(1.0, float(np.mean((self.weight * self.left**2)[np.abs(np.sum(self.images, axis=0)) > 0])))
+        """Chi2 over what noise leaves, at least one."""
+        return max(1.0, float(np.mean(self.weight * self.left**2)))
 
 
 def fit_shared(
@@ -140,17 +166,19 @@ def fit_shared(
         if np.abs(moved[:_SHARED] - since).max() > _MUCH:
             slopes, since = [_by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:_SHARED].copy()
         systems = [_linearise(w, m, k, optics, noise, parallel) for w, m, k in zip(windows, sets, slopes, strict=True)]
-        normal = precision + sum(e.common.T @ e.common / e.excess for e in systems)
+        told = [e.information() for e in systems]
+        normal = precision + sum(matrix for matrix, _ in told)
         if step == steps or converged:
             break
-        change = _step(normal, sum(e.common.T @ e.residual / e.excess for e in systems) - precision @ moved, taper)
+        change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
+        if np.abs(change[:_SHARED]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
+            change[:_SHARED] = 0.0  # new tables for so little are not worth their time
         moved += change
         taper += change[2]
         optics = replace(start, mu_px=start.mu_px * float(np.exp(moved[0])), sigma_px=start.sigma_px * float(np.exp(moved[1])))
         furthest = 0.0
         for i, e in enumerate(systems):
-            delta = e.own(e.residual - e.by_common @ change)
-            sets[i], shift = _moved(e.members, delta, change[_SHARED:], taper, parallel)
+            sets[i], shift = _moved(e.members, e.step(change), change[_SHARED:], taper, parallel)
             furthest = max(furthest, shift / max(e.sharpest_px, _FINEST_PX))
         converged = step > 0 and furthest < _CONVERGED
     errors = _common_errors(windows, systems, normal, precision, noise)
@@ -197,15 +225,16 @@ def _arms(window: _Window, fit: NeedleFit, optics: Optics) -> Float:
 
 
 def _by_optics(window: _Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
-    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n)."""
+    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n); how the ends slant hardly matters."""
     factor = np.exp(_STEP)
     denser, wider = replace(optics, mu_px=optics.mu_px * factor), replace(optics, sigma_px=optics.sigma_px * factor)
     out = []
     for f in members:
-        shorter = replace(f, shape=replace(f.shape, taper=f.shape.taper - _STEP))
-        here = _arms(window, f, optics)[0]
-        trials = _arms(window, f, denser)[0] - here, _arms(window, f, wider)[0] - here, here - _arms(window, shorter, optics)[0]
-        out.append(np.array(trials) / _STEP)
+        offsets = window.cols - f.position_px[0], window.rows - f.position_px[1]
+        shorter = replace(f.shape, taper=f.shape.taper - _STEP)
+        here, dense, wide = (arm_images(*offsets, f.angles, f.shape, o)[0] for o in (optics, denser, wider))
+        short = arm_images(*offsets, f.angles, shorter, optics)[0]
+        out.append(np.array([dense - here, wide - here, here - short]) / _STEP)
     return out
 
 
@@ -247,25 +276,22 @@ def _linearise(
     root = np.sqrt(weight)
     jac = np.concatenate([*moves, linear.T]).T * root[:, None]
     scale = np.maximum(np.linalg.norm(jac, axis=0), 1e-12)
-    prior = np.concatenate([*priors, np.zeros(linear.shape[1])]) / scale
-    basis, triangle = np.linalg.qr(np.concatenate([jac / scale, np.diag(np.hypot(prior, _RIDGE))]))
-    by_common = np.concatenate([common.T * root[:, None], np.zeros((len(scale), len(common)))])
+    jac /= scale
     left = window.data - linear @ theta
-    residual = np.concatenate([left * root, *known, np.zeros(linear.shape[1])])
-    images = [f.depths @ b[0] for f, b in zip(now, blocks, strict=True)]
+    rest = np.zeros(linear.shape[1])
     return _Equations(
-        now,
-        images,
-        weight,
-        left,
-        float(theta[-window.surface.shape[1]]),
-        residual,
-        basis,
-        triangle,
-        scale,
-        by_common,
-        by_common - basis @ (basis.T @ by_common),
-        parallel,
+        members=now,
+        images=[f.depths @ b[0] for f, b in zip(now, blocks, strict=True)],
+        weight=weight,
+        left=left,
+        background=float(theta[-window.surface.shape[1]]),
+        own=jac,
+        common=common.T * root[:, None],
+        residual=left * root,
+        scale=scale,
+        prior=np.concatenate([*priors, rest]) / scale,
+        known=np.concatenate([*known, rest]),
+        parallel=parallel,
     )
 
 
@@ -305,17 +331,17 @@ def _common_errors(windows: list[_Window], systems: list[_Equations], normal: Fl
     """Covariance of the common parameters, for noise that neighbouring pixels share."""
     spread = precision.copy()
     for window, e in zip(windows, systems, strict=True):
-        spread += influence_covariance(_patch(window, e.common[: len(e.weight)].T), noise.correlation) / e.excess
+        unexplained = e.common - e.own @ e.own_by_common
+        spread += influence_covariance(_patch(window, unexplained.T), noise.correlation) / e.excess
     inverse = np.linalg.inv(normal)
     covariance: Float = inverse @ spread @ inverse
     return covariance
 
 
 def _finished(window: _Window, e: _Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
-    to_own = (solve_triangular(e.triangle, e.basis.T).T / e.scale).T[e.tips]
-    influence = influence_covariance(_patch(window, to_own[:, : len(e.weight)]), noise.correlation)
-    by_common = to_own @ e.by_common
-    covariance = influence + by_common @ errors @ by_common.T
+    to_tips = (e.inverse @ e.own.T)[e.tips] / e.scale[e.tips, None]
+    by_common = (e.own_by_common / e.scale[:, None])[e.tips]
+    covariance = influence_covariance(_patch(window, to_tips), noise.correlation) + by_common @ errors @ by_common.T
     variance = float(noise.variance_at(np.array([e.background]))[0])
     out = []
     for i, (fit, image) in enumerate(zip(e.members, e.images, strict=True)):
