@@ -158,6 +158,9 @@ class FocusSolution:
     cage_effect : ndarray of shape (11, m)
         Change of these parameters for one standard deviation of each coordinate of the cage's marks, the same marks in the same columns
         for all foci; m = 0 for a cage without standard deviations. ``covariance_mm2`` holds both parts.
+    image_factor : float
+        By which the images of objects are less exact than stated, on top of ``fiducial_birge``, as all marks of the film and the crossings
+        show together.
     """
 
     focus: int
@@ -175,6 +178,7 @@ class FocusSolution:
     image_sd_px: float
     parameter_covariance: Float
     cage_effect: Float
+    image_factor: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,8 +12,10 @@ from rsa_vision.cages import Cage
 from rsa_vision.errors import CalibrationError, GeometryError
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.camera import Pinhole, camera_centre, camera_rays
-from rsa_vision.geometry.focus import UM_PER_MM, FocusFit, rays_of, solve_focus
-from rsa_vision.geometry.rays import RayBundle, intersect_lines, intersection_jacobians
+from rsa_vision.geometry.covariance import pooled_factor
+from rsa_vision.geometry.focus import UM_PER_MM, FocusFit, ray_effects, rays_of, solve_focus
+from rsa_vision.geometry.image_excess import image_excess
+from rsa_vision.geometry.rays import RayBundle, crossing_errors, intersect_lines, intersection_jacobians
 from rsa_vision.settings import Limits
 from rsa_vision.types import Float, FocusSolution, ImagePoints, Int, Markers, Reconstruction
 
@@ -79,9 +81,18 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits, tip_error: floa
         flags[rows] |= fit.flags
         bundles.append(rays_of(points.position_px[rows], points.covariance_px2[rows], fit.solution, cage, rows, fit.focus_by_image))
     bundle = _joined(bundles)
-    markers, distance, flags = intersect(_object_groups(points, bundle), bundle, flags, limits)
-    markers = replace(markers, covariance_mm2=markers.covariance_mm2 * crossing_factor(markers.crossing_um, markers.crossing_sd_um) ** 2)
-    objects = points.role == "object"
+    groups, objects = _object_groups(points, bundle), points.role == "object"
+    # what crosses within its statistics is told by stated errors: one wrong pair among few must not excuse itself by widening all of them
+    stated, distance, flags = intersect(groups, bundle, flags, limits)
+    factor = _image_factors(points, groups, bundle, fits, cage)
+    fits = {focus: replace(fit, solution=replace(fit.solution, image_factor=factor[focus])) for focus, fit in fits.items()}
+    wider = [
+        rays_of(points.position_px[rows], points.covariance_px2[rows], fit.solution, cage, rows)
+        for focus, fit in fits.items()
+        for rows in [np.flatnonzero((points.focus == focus) & objects)]
+    ]
+    bundle = _joined([bundle.rows(~objects[bundle.image]), *wider])
+    markers = replace(intersect(_object_groups(points, bundle), bundle, flags, limits)[0], flags=stated.flags)
     residual[objects] = distance[objects]
     used |= objects & np.isfinite(distance)
     common: Groups = {}
@@ -92,6 +103,43 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits, tip_error: floa
     controls = intersect(shared, bundle, flags, limits)[0]
     solutions = tuple(fit.solution for fit in fits.values())
     return Reconstruction(_flagged(points, flags), plane, residual, used, solutions, markers, controls)
+
+
+def _image_factors(points: ImagePoints, groups: Groups, bundle: RayBundle, fits: Mapping[int, FocusFit], cage: Cage) -> dict[int, float]:
+    """Return for every focus the factor by which object images are less exact than stated and than its fiducial marks already show.
+
+    What a film, its scanner or its bending do to images they do to those of marks and objects alike: the marks of all foci on a film tell
+    it together, and so do the crossings.
+    """
+    crossings = _crossing_factor(points, groups, bundle, [fit.solution for fit in fits.values()], cage)
+    film = {focus: int(points.film[points.focus == focus][0]) for focus in fits}
+    out = {}
+    for focus, fit in fits.items():
+        by_marks = pooled_factor([ratio for other in fits if film[other] == film[focus] for ratio in fits[other].ratios])
+        out[focus] = max(crossings, by_marks / fit.solution.fiducial_birge, 1.0)
+    return out
+
+
+def _crossing_factor(points: ImagePoints, groups: Groups, bundle: RayBundle, solutions: list[FocusSolution], cage: Cage) -> float:
+    """Return the factor by which the errors of object images are larger than stated, by the crossings of the first two rays of markers."""
+    pairs = np.array([rays[:2] for rays in groups.values() if len(rays) > 1], np.int64).reshape(-1, 2)
+    pairs = pairs[np.isfinite(bundle.through_mm[pairs].sum(axis=(1, 2)))]
+    if not len(pairs):
+        return 1.0
+    column = {solution.focus: k for k, solution in enumerate(solutions)}
+    cage_errors = solutions[0].cage_effect.shape[1]
+    shift = np.zeros((len(pairs), 2, 6, 11 * len(solutions) + cage_errors))
+    own = np.zeros((len(pairs), 2, 6, 6))
+    for solution in solutions:
+        mine = bundle.focus[pairs] == solution.focus
+        rows = bundle.image[pairs[mine]]
+        own[mine], effect = ray_effects(points.position_px[rows], points.covariance_px2[rows], solution, cage)
+        first = 11 * column[solution.focus]
+        by_focus = np.zeros((len(rows), *shift.shape[2:]))
+        by_focus[:, :, first : first + 11] = effect[:, :, :11]
+        by_focus[:, :, 11 * len(solutions) :] = effect[:, :, 11:]
+        shift[mine] = by_focus
+    return image_excess(*crossing_errors(bundle.through_mm[pairs], bundle.origin_mm[pairs], own, shift))
 
 
 def reconstruct_calibrated(points: ImagePoints, cameras: Mapping[int, Pinhole], limits: Limits) -> Reconstruction:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -31,11 +32,45 @@ def birge_factor(residuals: Float, covariance: Float) -> float:
         Square root of the sum of squares over its expectation, whose distribution is taken as chi-squared with the degrees of freedom
         that give it the right variance (Satterthwaite).
     """
+    return pooled_factor([residual_ratio(residuals, covariance)])
+
+
+def residual_ratio(residuals: Float, covariance: Float) -> tuple[float, float]:
+    """Return the sum of squares over its expectation, and its degrees of freedom; 1 and 0 where nothing is redundant.
+
+    Parameters
+    ----------
+    residuals : ndarray of shape (n,)
+    covariance : ndarray of shape (n, n)
+
+    Returns
+    -------
+    ratio, freedom : float
+        As of :func:`birge_factor`.
+    """
     expected = float(np.trace(covariance))
     spread = float((covariance**2).sum())
     if not (expected > 0 and spread > 0):
+        return 1.0, 0.0
+    return float(residuals @ residuals) / expected, expected**2 / spread
+
+
+def pooled_factor(ratios: Sequence[tuple[float, float]]) -> float:
+    """Return the Birge ratio of several sets of residuals together, 1 unless it is significant.
+
+    Parameters
+    ----------
+    ratios : sequence of (ratio, freedom)
+        As of :func:`residual_ratio`.
+
+    Returns
+    -------
+    float
+    """
+    freedom = sum(f for _, f in ratios)
+    if freedom == 0:
         return 1.0
-    ratio, freedom = float(residuals @ residuals) / expected, expected**2 / spread
+    ratio = sum(r * f for r, f in ratios) / freedom
     return float(np.sqrt(ratio)) if ratio > 1 and chdtrc(freedom, ratio * freedom) < SIGNIFICANCE else 1.0
 
 
@@ -146,6 +181,7 @@ class FocusErrors:
     fiducial_birge: float
     control_birge: float
     image_sd_px: float
+    ratios: tuple[tuple[float, float], tuple[float, float]]
 
 
 def propagate(
@@ -190,16 +226,18 @@ def propagate(
     of_controls = blocks(filled_covariance(px[controls], given[controls], image_sd))
 
     by_cage = first.residual_gain @ fiducial_shift
-    fiducial_birge = birge_factor(radial_mm, residual_by_image @ of_fiducials @ residual_by_image.T + by_cage @ by_cage.T)
+    of_plane = residual_ratio(radial_mm, residual_by_image @ of_fiducials @ residual_by_image.T + by_cage @ by_cage.T)
+    fiducial_birge = pooled_factor([of_plane])
     of_fiducials, of_controls = of_fiducials * fiducial_birge**2, of_controls * fiducial_birge**2
     parameters_by_cage = first.gain @ fiducial_shift
     by_cage = second.residual_by_parameter @ parameters_by_cage + second.residual_by_mark @ control_shift
-    control_birge = birge_factor(
+    ratio, freedom = residual_ratio(
         line_mm,
         line_by_fiducial @ of_fiducials @ line_by_fiducial.T
         + second.residual_by_image @ of_controls @ second.residual_by_image.T
         + by_cage @ by_cage.T,
     )
+    control_birge = pooled_factor([(ratio, freedom)])
 
     all_by_parameter = np.vstack([np.eye(8), control_birge * second.focus_by_parameter])
     all_by_fiducial = all_by_parameter @ parameter_by_image
@@ -207,7 +245,7 @@ def propagate(
     covariance[8:, 8:] += control_birge**2 * second.focus_by_image @ of_controls @ second.focus_by_image.T
     effect = all_by_parameter @ parameters_by_cage
     effect[8:] += control_birge * second.focus_by_mark @ control_shift
-    return FocusErrors(covariance, effect, fiducial_birge, control_birge, image_sd)
+    return FocusErrors(covariance, effect, fiducial_birge, control_birge, image_sd, (of_plane, (ratio * fiducial_birge**2, freedom)))
 
 
 def filled_covariance(px: Float, covariance_px2: Float, image_sd_px: float) -> Float:

@@ -39,6 +39,9 @@ class FocusFit:
         Index into ``cage.mark``; -1 for all other points.
     focus_by_image : ndarray of shape (n, 3, 2)
         Change of the focus for a shift of each control point's image on the film, mm/px; 0 for all other points.
+    ratios : pair of (ratio, freedom)
+        Squares of the residuals of both steps over what stated image errors let expect
+        (:func:`rsa_vision.geometry.covariance.residual_ratio`).
     """
 
     solution: FocusSolution
@@ -48,6 +51,7 @@ class FocusFit:
     flags: Int
     mark: Int
     focus_by_image: Float
+    ratios: tuple[tuple[float, float], tuple[float, float]]
 
 
 def solve_focus(points: ImagePoints, cage: Cage, focus: int, limits: Limits, tip_error: float = 0.0) -> FocusFit:
@@ -106,27 +110,15 @@ def rays_of(
     image : ndarray of int, shape (n,), optional
         Names the rays; default 0, 1, 2 ...
     focus_by_image : ndarray of shape (n, 3, 2), optional
-        As of :class:`FocusFit`, for images that the focus itself was computed from.
+        As of :class:`FocusFit`, for images that the focus itself was computed from; without it they are those of objects.
 
     Returns
     -------
     RayBundle
     """
     n = len(position_px)
-    origin, basis = cage.plane_of(solution.focus).lab_from_plane()
-    through = origin + apply_homography(solution.plane_from_film, position_px) @ basis
-    by_point, by_parameter = homography_jacobians(solution.plane_from_film, position_px)
-    own = np.zeros((n, 6, 2))
-    own[:, :3] = basis.T @ by_point
-    if focus_by_image is not None:
-        own[:, 3:] = focus_by_image
-    common = np.zeros((n, 6, 11))
-    common[:, :3, :8] = basis.T @ by_parameter
-    common[:, 3:, 8:] = np.eye(3)
-    stated = filled_covariance(position_px, covariance_px2, solution.image_sd_px) * solution.fiducial_birge**2
-    # the focus's own covariance has the part of these images already: only their correlation with the ray is new
-    covariance = own @ stated @ own.swapaxes(1, 2)
-    covariance[:, 3:, 3:] = 0
+    through, own, common = _ray_errors(position_px, covariance_px2, solution, cage, focus_by_image)
+    covariance = own * (solution.image_factor**2 if focus_by_image is None else 1.0)
     covariance += common @ solution.parameter_covariance @ common.swapaxes(1, 2)
     return RayBundle(
         np.arange(n) if image is None else image,
@@ -136,6 +128,49 @@ def rays_of(
         covariance,
         common @ solution.cage_effect,
     )
+
+
+def ray_effects(position_px: Float, covariance_px2: Float, solution: FocusSolution, cage: Cage) -> tuple[Float, Float]:
+    """Return the errors of rays apart: by their own images, and by what they share.
+
+    Parameters
+    ----------
+    position_px, covariance_px2, solution, cage
+        As of :func:`rays_of`.
+
+    Returns
+    -------
+    own_mm2 : ndarray of shape (n, 6, 6)
+        Covariance of (through, origin) by each ray's image.
+    effect_mm : ndarray of shape (n, 6, 11 + m)
+        Change of (through, origin) for one standard deviation of each independent error of homography and focus, and of the m of the cage.
+    """
+    _, own, common = _ray_errors(position_px, covariance_px2, solution, cage, None)
+    value, vector = np.linalg.eigh(solution.parameter_covariance)
+    root = vector * np.sqrt(np.maximum(value, 0.0))
+    return own, np.concatenate([common @ root, common @ solution.cage_effect], axis=2)
+
+
+def _ray_errors(
+    position_px: Float, covariance_px2: Float, solution: FocusSolution, cage: Cage, focus_by_image: Float | None
+) -> tuple[Float, Float, Float]:
+    """Points of rays in the fiducial plane, their covariance by their own images, and their change by the parameters of the focus."""
+    n = len(position_px)
+    origin, basis = cage.plane_of(solution.focus).lab_from_plane()
+    through = origin + apply_homography(solution.plane_from_film, position_px) @ basis
+    by_point, by_parameter = homography_jacobians(solution.plane_from_film, position_px)
+    by_image = np.zeros((n, 6, 2))
+    by_image[:, :3] = basis.T @ by_point
+    if focus_by_image is not None:
+        by_image[:, 3:] = focus_by_image
+    common = np.zeros((n, 6, 11))
+    common[:, :3, :8] = basis.T @ by_parameter
+    common[:, 3:, 8:] = np.eye(3)
+    stated = filled_covariance(position_px, covariance_px2, solution.image_sd_px) * solution.fiducial_birge**2
+    # the focus's own covariance has the part of these images already: only their correlation with the ray is new
+    own = by_image @ stated @ by_image.swapaxes(1, 2)
+    own[:, 3:, 3:] = 0
+    return through, own, common
 
 
 def _solve(points: ImagePoints, cage: Cage, focus: int, limits: Limits, tip_error: float) -> FocusFit:
@@ -201,7 +236,7 @@ def _solve(points: ImagePoints, cage: Cage, focus: int, limits: Limits, tip_erro
         errors.parameter_covariance,
         errors.cage_effect,
     )
-    return FocusFit(solution, plane, residual, used, flags, mark, focus_by_image)
+    return FocusFit(solution, plane, residual, used, flags, mark, focus_by_image, errors.ratios)
 
 
 def _match(points: ImagePoints, cage: Cage, focus: int) -> tuple[Int, Int]:

@@ -186,6 +186,36 @@ def cross(a: RayBundle, b: RayBundle) -> tuple[Float, Float, Float]:
     return (point_a + point_b) / 2, np.abs(signed), np.sqrt(variance)
 
 
+def crossing_errors(through_mm: Float, origin_mm: Float, own_mm2: Float, effect_mm: Float) -> tuple[Float, Float, Float]:
+    """Return the signed crossing errors of pairs of rays, and what they have from each ray alone and in common.
+
+    Parameters
+    ----------
+    through_mm, origin_mm : ndarray of shape (n, 2, 3)
+    own_mm2 : ndarray of shape (n, 2, 6, 6)
+        Covariance of (through, origin) by the ray's own image.
+    effect_mm : ndarray of shape (n, 2, 6, m)
+        Change for one standard deviation of each error that rays share.
+
+    Returns
+    -------
+    crossing_mm, own_variance_mm2 : ndarray of shape (n,)
+    effect_mm : ndarray of shape (n, m)
+        As :func:`cross` has them; pairs of parallel rays are left out.
+    """
+    (through_a, through_b), (origin_a, origin_b) = through_mm.swapaxes(0, 1), origin_mm.swapaxes(0, 1)
+    point_a, point_b, fraction_a, fraction_b = closest_approach(through_a, origin_a, through_b, origin_b)
+    perpendicular = np.cross(origin_a - through_a, origin_b - through_b)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        perpendicular /= np.linalg.norm(perpendicular, axis=-1, keepdims=True)
+    leverage = np.stack([-_leverage(perpendicular, fraction_a), _leverage(perpendicular, fraction_b)], axis=1)
+    signed = (perpendicular * (point_b - point_a)).sum(-1)
+    variance = np.einsum("nki,nkij,nkj->n", leverage, own_mm2, leverage)
+    effect = np.einsum("nki,nkim->nm", leverage, effect_mm)
+    known = np.isfinite(signed)
+    return signed[known], variance[known], effect[known]
+
+
 def _dot(a: Float, b: Float) -> Float:
     product: Float = np.einsum("...i,...i->...", a, b)  # sums over a short last axis take several times as long
     return product

@@ -15,7 +15,7 @@ from rsa_vision.geometry.focus import rays_of, tip_shift
 from rsa_vision.geometry.rays import cross
 from rsa_vision.settings import Limits
 from rsa_vision.types import ImagePoints, Reconstruction
-from rsa_vision.xray import crossing_factor, reconstruct
+from rsa_vision.xray import reconstruct
 
 WIDE = Limits(fiducial_um=1e6, line_mm=1e6)  # no gross-error rule: it would cut the tails of drawn errors
 LINEAR = 2e-4  # relative, at exact points
@@ -273,5 +273,18 @@ def test_crossings_tell_of_errors_that_the_cage_does_not_show() -> None:
         assert all(focus.fiducial_birge < 2 for focus in found.foci)
         error = found.markers.position_mm - objects
         ratios.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.markers.covariance_mm2), error) / 3)
-        assert crossing_factor(found.markers.crossing_um, found.markers.crossing_sd_um) > 1
+        assert all(focus.image_factor > 1 for focus in found.foci)
     assert 0.8 < np.sqrt(np.mean(ratios)) < 1.3
+
+
+def test_film_errors_that_no_detector_states_widen_the_markers() -> None:
+    rng = np.random.default_rng(32)
+    cage, _, objects, points = exposure("1B", rng)
+    ratios = []
+    for _ in range(60):
+        shaken = replace(points, position_px=points.position_px + 0.1 * rng.standard_normal(points.position_px.shape))
+        found = reconstruct(with_sd(shaken, 0.03), cage, WIDE)
+        error = found.markers.position_mm - objects
+        ratios.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.markers.covariance_mm2), error))
+    assert np.sqrt(np.mean(ratios) / 3) < 1.3
+    assert np.mean(np.sqrt(ratios) > 6) < 0.002
