@@ -17,7 +17,7 @@ from rsa_vision.sightlines import Sightlines
 from rsa_vision.tables import AXES, SCHEMAS, Row, Rows, marker_rows, name_of, plain
 from rsa_vision.types import Float, Int, Markers
 from rsa_vision.verdict import conclude
-from rsa_vision.xray import crossing_factor, intersect
+from rsa_vision.xray import intersect
 
 CODE: Final = "pair-ambiguous"
 
@@ -31,12 +31,6 @@ def cloud_of(markers: Sequence[Row]) -> Cloud:
         xy, xz, yz = (row[f"cov_{pair}_mm2"] or 0.0 for pair in ("xy", "xz", "yz"))
         covariance[i] = np.diag(sd**2) + np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
     return Cloud(position, covariance)
-
-
-def error_factor(markers: Sequence[Row]) -> float:
-    """Return the factor by which crossing errors show the errors of an examination to be larger than stated."""
-    figures = [[np.nan if row[name] is None else row[name] for row in markers] for name in ("crossing_um", "crossing_sd_um")]
-    return crossing_factor(*(np.array(values, np.float64) for values in figures))
 
 
 def settle_pairs(rows: Rows, segments: Sequence[Segment], limits: Limits) -> Rows:
@@ -82,10 +76,9 @@ def _intersected(rows: Rows, contest: Sightlines, groups: Iterable[int], limits:
     flags = np.array([flag_value(row["flags"] or "") for row in rows["images"]], np.int64) & ~int(MarkerFlag.AMBIGUOUS)
     rays = {f"contested-{c}": list(contest.contested[c]) for c in groups}
     markers, distance_um, flags = intersect(rays, contest.rays, flags, limits)
-    covariance = error_factor(rows["markers"]) ** 2 * markers.covariance_mm2
     has_parallax = any(row["parallax_um"] is not None for row in rows["markers"])
     parallax = markers.parallax_um if has_parallax else np.full(len(markers), np.nan)  # calibrated cameras have none
-    return replace(markers, covariance_mm2=covariance, parallax_um=parallax), distance_um, flags
+    return replace(markers, parallax_um=parallax), distance_um, flags
 
 
 def _with_pairs(rows: Rows, contest: Sightlines, sure: Sequence[int], names: set[str], limits: Limits) -> Rows:

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from rsa_vision.contests import error_factor
 from rsa_vision.flags import MarkerFlag, flag_names, flag_value
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.constellation import LOOSE_SIGMA, Known
@@ -88,11 +87,10 @@ def find_sightings(rows: Rows, cloud: Cloud, bodies: Sequence[Cloud], matched: S
 
 
 def _free_rays(rows: Rows) -> RayBundle:
-    """Return the rays of images that show no marker so far; where crossings are larger than stated, so are their errors."""
+    """Return the rays of images that show no marker so far."""
     rays = Sightlines.read(rows).rays
     free = np.array([is_free(rows["images"][i]) for i in rays.image.tolist()], bool)
-    factor = error_factor(rows["markers"])
-    return replace(rays.rows(free), covariance_mm2=factor**2 * rays.covariance_mm2[free])
+    return rays.rows(free)
 
 
 def hidden_of(names: Sequence[str], body: Cloud, sighting: Sighting) -> list[HiddenMarker]:

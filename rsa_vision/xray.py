@@ -24,7 +24,6 @@ __all__ = [
     "FocusFit",
     "calibration_error",
     "check_controls",
-    "crossing_factor",
     "intersect",
     "rays_of",
     "reconstruct",
@@ -82,7 +81,7 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits, tip_error: floa
         bundles.append(rays_of(points.position_px[rows], points.covariance_px2[rows], fit.solution, cage, rows, fit.focus_by_image))
     bundle = _joined(bundles)
     groups, objects = _object_groups(points, bundle), points.role == "object"
-    # what crosses within its statistics is told by stated errors: one wrong pair among few must not excuse itself by widening all of them
+    # crossings are judged by stated errors: wrong pairs must not excuse themselves by widening all of them
     stated, distance, flags = intersect(groups, bundle, flags, limits)
     factor = _image_factors(points, groups, bundle, fits, cage)
     fits = {focus: replace(fit, solution=replace(fit.solution, image_factor=factor[focus])) for focus, fit in fits.items()}
@@ -92,7 +91,7 @@ def reconstruct(points: ImagePoints, cage: Cage, limits: Limits, tip_error: floa
         for rows in [np.flatnonzero((points.focus == focus) & objects)]
     ]
     bundle = _joined([bundle.rows(~objects[bundle.image]), *wider])
-    markers = replace(intersect(_object_groups(points, bundle), bundle, flags, limits)[0], flags=stated.flags)
+    markers = replace(stated, covariance_mm2=intersect(_object_groups(points, bundle), bundle, flags, limits)[0].covariance_mm2)
     residual[objects] = distance[objects]
     used |= objects & np.isfinite(distance)
     common: Groups = {}
@@ -111,7 +110,7 @@ def _image_factors(points: ImagePoints, groups: Groups, bundle: RayBundle, fits:
     What a film, its scanner or its bending do to images they do to those of marks and objects alike: the marks of all foci on a film tell
     it together, and so do the crossings.
     """
-    crossings = _crossing_factor(points, groups, bundle, [fit.solution for fit in fits.values()], cage)
+    crossings = _factor_by_crossings(points, groups, bundle, [fit.solution for fit in fits.values()], cage)
     film = {focus: int(points.film[points.focus == focus][0]) for focus in fits}
     out = {}
     for focus, fit in fits.items():
@@ -120,7 +119,7 @@ def _image_factors(points: ImagePoints, groups: Groups, bundle: RayBundle, fits:
     return out
 
 
-def _crossing_factor(points: ImagePoints, groups: Groups, bundle: RayBundle, solutions: list[FocusSolution], cage: Cage) -> float:
+def _factor_by_crossings(points: ImagePoints, groups: Groups, bundle: RayBundle, solutions: list[FocusSolution], cage: Cage) -> float:
     """Return the factor by which the errors of object images are larger than stated, by the crossings of the first two rays of markers."""
     pairs = np.array([rays[:2] for rays in groups.values() if len(rays) > 1], np.int64).reshape(-1, 2)
     pairs = pairs[np.isfinite(bundle.through_mm[pairs].sum(axis=(1, 2)))]
@@ -220,28 +219,6 @@ def calibration_error(markers_at: Callable[[float], Markers]) -> float:
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if np.median(ratios(middle)) > _MEDIAN_CHI2 else (low, middle)
     return float(np.sqrt(low * high)) if low > 1e-3 else 0.0
-
-
-def crossing_factor(crossing_um: Float, crossing_sd_um: Float) -> float:
-    """Return the factor by which the crossing errors show the markers' standard deviations to be too small.
-
-    Parameters
-    ----------
-    crossing_um, crossing_sd_um : ndarray of shape (n,)
-        Crossing errors of markers and their standard deviations; NaN where there is none.
-
-    Returns
-    -------
-    float
-        1 where the stated errors explain the crossings (chi-square, p > 0.01) or fewer than five markers could tell; else the root of the
-        median of the squared ratios of crossing errors and their standard deviations, against that of chi-square: single wrong pairs,
-        which their own crossing errors show, leave the others alone.
-    """
-    squares = (crossing_um / crossing_sd_um) ** 2
-    squares = squares[np.isfinite(squares)]
-    if len(squares) < _LEAST_FOR_CROSSINGS or chdtrc(len(squares), squares.sum()) > _UNEXPLAINED_P:
-        return 1.0
-    return max(float(np.sqrt(np.median(squares) / _MEDIAN_CHI2)), 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

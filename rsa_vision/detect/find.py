@@ -19,9 +19,7 @@ from rsa_vision.types import Bool, Float
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
-MISFIT = (
-    0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/detection.md
-)
+MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
 EXPLAINED = 0.9
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
