@@ -231,7 +231,8 @@ def test_rays_of_unnamed_images_cross_within_their_sigma() -> None:
         bundles = []
         for focus in found.foci:
             rows = np.flatnonzero((noisy.focus == focus.focus) & (noisy.role == "object"))
-            bundles.append(rays_of(noisy.position_px[rows], noisy.covariance_px2[rows], focus, cage, rows))
+            stated = replace(focus, image_factor=1.0)  # by which crossings are judged
+            bundles.append(rays_of(noisy.position_px[rows], noisy.covariance_px2[rows], stated, cage, rows))
         position, crossing, sigma = cross(*bundles)
         diagonal = np.arange(len(objects))
         np.testing.assert_allclose(position[diagonal, diagonal], found.markers.position_mm, atol=1e-6)
