@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
-from rsa_vision.detect.find import MISFIT, ROUNDNESS, STRENGTH, distinct, first_look, fit_at, misfit, plausible, significance_limit
+from rsa_vision.detect.find import CHANCE, MISFIT, ROUNDNESS, STRENGTH, distinct, first_look, fit_at, misfit, plausible, significance_limit
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needles import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
@@ -236,7 +236,7 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     flags[(valid < 0.999) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < 0.8] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
-    poor = np.concatenate([misfit(balls, noise), [t.misfit for t in tees]]) > 0.6 * MISFIT
+    poor = np.concatenate([misfit(balls, noise, CHANCE), [t.misfit for t in tees]]) > 0.6 * MISFIT
     poor[:n] |= balls.chi2_ring > EDGE
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it

@@ -12,7 +12,7 @@ from rsa_vision.detect.patches import Patches
 from rsa_vision.detect.profiles import BallTable, ball_table
 from rsa_vision.types import Bool, Float
 
-RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; the range is 2.5 to 12
+RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are what is looked for
 _STEPS = 12
 _REWEIGHTED = (2, 5)  # steps
 _BATCH = 40  # windows that stay in the cache

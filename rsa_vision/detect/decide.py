@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.balls import RADIUS_PX, BallFits
 from rsa_vision.detect.find import significance
 from rsa_vision.types import Bool, Float
 
@@ -41,7 +41,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float) -> Bool:
     """
     strength = over_clutter(fits)
     spot = np.hypot(sigma_px, 0.5 * fits.radius_px) < SPOT_PX
-    sure = (strength > max(SURE, limit)) & ~spot
+    # what would be larger still than the fit may go is no ball of that size
+    sure = (strength > max(SURE, limit)) & ~spot & (fits.radius_px < RADIUS_PX[1])
     pattern = sure & (fits.explained > CLOSE)
     patterns = fits.radius_px[pattern]
     if len(patterns) < _LEAST_PATTERNS:
@@ -50,4 +51,5 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float) -> Bool:
     sure &= height > FAINT * np.median(height[pattern])
     low, high = _SMALLER * float(patterns.min()), _LARGER * float(patterns.max())
     alike = (fits.radius_px > low) & (fits.radius_px < high) & (height > FAINT * np.median(height[pattern]))
+    alike &= fits.radius_px < RADIUS_PX[1]
     return np.asarray((significance(fits) > limit) & alike & (sure | (strength > 0.5 * SURE)))

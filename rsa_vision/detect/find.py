@@ -20,6 +20,7 @@ STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real 
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
+CHANCE = 2.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
@@ -66,9 +67,13 @@ def fit_at(
     return fits.rows(np.argsort(np.concatenate(order)))
 
 
-def misfit(fits: BallFits, noise: NoiseModel) -> Float:
-    """Return the RMS residual under the ball beyond the noise, as a fraction of the depth, shape (n,)."""
-    excess = np.maximum(fits.chi2_core - 1.0, 0.0) * noise.variance_at(fits.background)
+def misfit(fits: BallFits, noise: NoiseModel, chance: float = 0.0) -> Float:
+    """Return the RMS residual under the ball beyond the noise, as a fraction of the depth, shape (n,).
+
+    ``chance``: so many standard deviations that the mean square of noise alone may be above its expectation do not count.
+    """
+    pixels = np.pi * (fits.radius_px + 1) ** 2
+    excess = np.maximum(fits.chi2_core - 1.0 - chance * np.sqrt(2 / pixels), 0.0) * noise.variance_at(fits.background)
     rest: Float = np.sqrt(excess) / np.maximum(np.abs(fits.depth), 1e-9)
     return rest
 
@@ -108,7 +113,7 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     least = 1 - (1 - EXPLAINED) * slack
     stands_out = strength / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
     explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
-    return usable & (misfit(fits, noise) < MISFIT * slack) & explained & (strength > 5.0)
+    return usable & (misfit(fits, noise, CHANCE) < MISFIT * slack) & explained & (strength > 5.0)
 
 
 def explained_over_noise(fits: BallFits) -> Float:
