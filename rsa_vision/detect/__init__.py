@@ -170,7 +170,7 @@ def _one_polarity(
 
     balls, touching = resolve_balls(film, mine, seeds, optics, noise, needle_images if needles else None)
     limit = significance_limit(film.size, 2.5, false_detections)
-    keep = are_balls(balls, limit, optics.sigma_px) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
+    keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching = balls.rows(keep), touching[keep]
     for fit in doubtful:
         if found := part(film, fit, balls, optics, tee_optics, noise, needle_images, is_tee):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from rsa_vision.detect.balls import RADIUS_PX, BallFits
-from rsa_vision.detect.find import significance
+from rsa_vision.detect.find import MISFIT, misfit, significance
+from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float
 
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
+UNEXCUSED = 0.5  # those below that have to fit closely
 EDGE = 16.0  # more variance than this around a ball, in units of the noise, is an edge beside it; edges do not look like balls
 SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
 _LEAST_PATTERNS = 3  # sure balls from which their sizes tell something of the others
@@ -23,7 +25,7 @@ def over_clutter(fits: BallFits) -> Float:
     return out
 
 
-def are_balls(fits: BallFits, limit: float, sigma_px: float) -> Bool:
+def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:
     """Say which balls are marks.
 
     Parameters
@@ -34,6 +36,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float) -> Bool:
         Significance that noise alone would exceed too often.
     sigma_px : float
         Blur of the film.
+    noise : NoiseModel
 
     Returns
     -------
@@ -43,13 +46,17 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float) -> Bool:
     spot = np.hypot(sigma_px, 0.5 * fits.radius_px) < SPOT_PX
     # what would be larger still than the fit may go is no ball of that size
     sure = (strength > max(SURE, limit)) & ~spot & (fits.radius_px < RADIUS_PX[1])
-    pattern = sure & (fits.explained > CLOSE)
+    close = misfit(fits, noise) < MISFIT
+    pattern = sure & close & (fits.explained > CLOSE)
     patterns = fits.radius_px[pattern]
     if len(patterns) < _LEAST_PATTERNS:
         return np.asarray(sure)
     height = np.abs(fits.depth) * -np.expm1(-0.5 * (fits.radius_px / sigma_px) ** 2)  # of the blurred image, roughly
-    sure &= height > FAINT * np.median(height[pattern])
+    typical = float(np.median(height[pattern]))
+    # of fainter things on a film of clear marks noise is no excuse for what the model leaves
+    high_enough = height > np.where(close, FAINT, UNEXCUSED) * typical
+    sure &= high_enough
     low, high = _SMALLER * float(patterns.min()), _LARGER * float(patterns.max())
-    alike = (fits.radius_px > low) & (fits.radius_px < high) & (height > FAINT * np.median(height[pattern]))
+    alike = (fits.radius_px > low) & (fits.radius_px < high) & high_enough
     alike &= fits.radius_px < RADIUS_PX[1]
     return np.asarray((significance(fits) > limit) & alike & (sure | (strength > 0.5 * SURE)))

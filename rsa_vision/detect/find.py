@@ -20,7 +20,7 @@ STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real 
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
-CHANCE = 2.0  # standard deviations of the mean square of noise, for which no mark is blamed
+CHANCE = 3.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
@@ -70,10 +70,10 @@ def fit_at(
 def misfit(fits: BallFits, noise: NoiseModel, chance: float = 0.0) -> Float:
     """Return the RMS residual under the ball beyond the noise, as a fraction of the depth, shape (n,).
 
-    ``chance``: so many standard deviations that the mean square of noise alone may be above its expectation do not count.
+    ``chance``: what is within so many standard deviations of the mean square of noise alone does not count.
     """
-    pixels = np.pi * (fits.radius_px + 1) ** 2
-    excess = np.maximum(fits.chi2_core - 1.0 - chance * np.sqrt(2 / pixels), 0.0) * noise.variance_at(fits.background)
+    excess = np.maximum(fits.chi2_core - 1.0, 0.0)
+    excess = np.where(excess > chance * np.sqrt(2 / (np.pi * (fits.radius_px + 1) ** 2)), excess, 0.0) * noise.variance_at(fits.background)
     rest: Float = np.sqrt(excess) / np.maximum(np.abs(fits.depth), 1e-9)
     return rest
 
