@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,56 @@ _STEPS = 16
 _CONVERGED_PX = 1e-3
 _LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
 _GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """Pixels of pins or tees that are fitted together.
+
+    Attributes
+    ----------
+    cols, rows, data, beside : ndarray of shape (n,)
+        Places on the film; its values, the images of neighbours taken away; those images.
+    surface : ndarray of shape (n, 6)
+        Columns of a quadratic background.
+    corner_px : ndarray of shape (2,)
+        (col, row) of the first pixel of the square around them.
+    size : int
+        Its side.
+    """
+
+    cols: Float
+    rows: Float
+    data: Float
+    beside: Float
+    surface: Float
+    corner_px: Float
+    size: int
+
+    def square(self, values: Float) -> Float:
+        """Put values at the pixels, shape (p, n), into the square, shape (p, size, size)."""
+        out = np.zeros((len(values), self.size, self.size))
+        at = (self.rows - self.corner_px[1]).astype(np.intp), (self.cols - self.corner_px[0]).astype(np.intp)
+        out[:, *at] = values
+        return out
+
+
+def window_of(film: NDArray[Any], needles: Sequence[NeedleFit], optics: Optics, noise: NoiseModel, others: Images | None) -> Window:
+    """Cut out the pixels around the arms of some needles, the images of others taken away."""
+    middle = np.mean([f.position_px for f in needles], axis=0)
+    spread = max(float(np.abs(f.position_px - middle).max()) for f in needles)
+    half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in needles) + 3 * optics.sigma_px + 3))
+    patch = cut(film, middle[None], half, noise)
+    corner = patch.corner_px[0].astype(np.float64)
+    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
+    cols, rows = cols + corner[0], rows + corner[1]
+    near = np.zeros(cols.shape, bool)
+    for f in needles:
+        near |= support(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, 3 * optics.sigma_px + 4.0)
+    near &= patch.valid[0]
+    cols, rows, raw = cols[near], rows[near], patch.values[0][near]
+    beside = np.zeros_like(raw) if others is None else others(cols, rows)
+    return Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]), corner, patch.size)
 
 
 def fit_crossing(
@@ -51,24 +101,9 @@ def fit_crossing(
         In the order of the starts; figures of merit are taken under each needle's own arms.
     """
     now = list(needles)
-    middle = np.mean([f.position_px for f in now], axis=0)
-    spread = max(float(np.abs(f.position_px - middle).max()) for f in now)
-    half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in now) + 3 * optics.sigma_px + 3))
-    patch = cut(film, middle[None], half, noise)
-    corner = patch.corner_px[0].astype(np.float64)
-    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
-    cols, rows = cols + corner[0], rows + corner[1]
-    near = np.zeros(cols.shape, bool)
-    keep = patch.valid[0].copy()
-    for f in now:
-        dx, dy = cols - f.position_px[0], rows - f.position_px[1]
-        near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + 4.0)
-    keep &= near
-    cols, rows, raw = cols[keep], rows[keep], patch.values[0][keep]
-    neighbours = np.zeros_like(raw) if others is None else others(cols, rows)
-    data = raw - neighbours
-    surface = polynomial(half, cols - middle[0], rows - middle[1])
-    weight = 1.0 / noise.variance_at(raw)
+    window = window_of(film, now, optics, noise, others)
+    cols, rows, data, neighbours, surface, half = window.cols, window.rows, window.data, window.beside, window.surface, window.size // 2
+    weight = 1.0 / noise.variance_at(data + neighbours)
     each = 5
     converged = False
     ground = np.zeros(len(data))  # background above its mean under each pixel
@@ -95,9 +130,7 @@ def fit_crossing(
         converged = step > 1 and float(np.abs(delta[:, :2]).max()) < _CONVERGED_PX
     covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
     places = [each * i + axis for i in range(len(now)) for axis in range(2)]
-    influence = np.zeros((len(places), patch.size, patch.size))
-    at = (rows - corner[1]).astype(np.intp), (cols - corner[0]).astype(np.intp)
-    influence[:, *at] = covariance[places] @ (jac * np.sqrt(weight)[:, None]).T
+    influence = window.square(covariance[places] @ (jac * np.sqrt(weight)[:, None]).T)
     variance = float(noise.variance_at(np.array([theta[-6]]))[0])
     out = []
     for i, (f, block) in enumerate(zip(now, blocks, strict=True)):

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import polynomial
-from rsa_vision.detect.crossing import between, gain_at, lapping, scored
+from rsa_vision.detect.crossing import Window, between, gain_at, lapping, scored, window_of
 from rsa_vision.detect.needle_sets import clusters, others_beside
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, core_pixels, support
+from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, core_pixels
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.patches import columns, cut, weighted_least_squares
+from rsa_vision.detect.patches import columns, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float, Int
 
@@ -43,19 +42,6 @@ _OF_SLANTS = {
     3: np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0, 0, -1]]),
 }
 _RIDGE = 1e-4  # relative: keeps what the pixels do not determine where it is
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Window:
-    """Pixels of needles that are fitted together; ``beside``: images of the others there."""
-
-    cols: Float
-    rows: Float
-    data: Float
-    beside: Float
-    surface: Float
-    corner_px: Float
-    size: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,22 +174,9 @@ def fit_shared(
     return out, optics
 
 
-def _window(film: NDArray[Any], members: list[NeedleFit], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> _Window:
-    middle = np.mean([f.position_px for f in members], axis=0)
-    spread = max(float(np.abs(f.position_px - middle).max()) for f in members)
-    half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in members) + 3 * optics.sigma_px + 3))
-    patch = cut(film, middle[None], half, noise)
-    corner = patch.corner_px[0].astype(np.float64)
-    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
-    cols, rows = cols + corner[0], rows + corner[1]
-    near = np.zeros(cols.shape, bool)
-    for f in members:
-        near |= support(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, 3 * optics.sigma_px + 4.0)
-    near &= patch.valid[0]
-    cols, rows, raw = cols[near], rows[near], patch.values[0][near]
+def _window(film: NDArray[Any], members: list[NeedleFit], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> Window:
     others = others_beside(members, [t for t in needles if all(t is not m for m in members)], optics)
-    beside = others(cols, rows) if others else np.zeros_like(raw)
-    return _Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]), corner, patch.size)
+    return window_of(film, members, optics, noise, others)
 
 
 def _step(normal: Float, target: Float, taper: float) -> Float:
@@ -219,12 +192,12 @@ def _step(normal: Float, target: Float, taper: float) -> Float:
     return change
 
 
-def _arms(window: _Window, fit: NeedleFit, optics: Optics) -> Float:
+def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
     slants = np.zeros((2, len(fit.angles))) if fit.slants is None else fit.slants
     return arm_images(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit.angles, fit.shape, optics, slants)
 
 
-def _by_optics(window: _Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
+def _by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
     """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n); how the ends slant hardly matters."""
     factor = np.exp(_STEP)
     denser, wider = replace(optics, mu_px=optics.mu_px * factor), replace(optics, sigma_px=optics.sigma_px * factor)
@@ -239,7 +212,7 @@ def _by_optics(window: _Window, members: list[NeedleFit], optics: Optics) -> lis
 
 
 def _linearise(
-    window: _Window, members: list[NeedleFit], slopes: list[Float], optics: Optics, noise: NoiseModel, parallel: bool
+    window: Window, members: list[NeedleFit], slopes: list[Float], optics: Optics, noise: NoiseModel, parallel: bool
 ) -> _Equations:
     blocks = [_arms(window, f, optics) for f in members]
     # a first background for the gain; the next round has a better one
@@ -319,29 +292,21 @@ def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, taper: floa
     return out, shift
 
 
-def _patch(window: _Window, rows: Float) -> Float:
-    """Put values at the pixels of a window, shape (p, n), into its square."""
-    out = np.zeros((len(rows), window.size, window.size))
-    at = (window.rows - window.corner_px[1]).astype(np.intp), (window.cols - window.corner_px[0]).astype(np.intp)
-    out[:, *at] = rows
-    return out
-
-
-def _common_errors(windows: list[_Window], systems: list[_Equations], normal: Float, precision: Float, noise: NoiseModel) -> Float:
+def _common_errors(windows: list[Window], systems: list[_Equations], normal: Float, precision: Float, noise: NoiseModel) -> Float:
     """Covariance of the common parameters, for noise that neighbouring pixels share."""
     spread = precision.copy()
     for window, e in zip(windows, systems, strict=True):
         unexplained = e.common - e.own @ e.own_by_common
-        spread += influence_covariance(_patch(window, unexplained.T), noise.correlation) / e.excess
+        spread += influence_covariance(window.square(unexplained.T), noise.correlation) / e.excess
     inverse = np.linalg.inv(normal)
     covariance: Float = inverse @ spread @ inverse
     return covariance
 
 
-def _finished(window: _Window, e: _Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
+def _finished(window: Window, e: _Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
     to_tips = (e.inverse @ e.own.T)[e.tips] / e.scale[e.tips, None]
     by_common = (e.own_by_common / e.scale[:, None])[e.tips]
-    covariance = influence_covariance(_patch(window, to_tips), noise.correlation) + by_common @ errors @ by_common.T
+    covariance = influence_covariance(window.square(to_tips), noise.correlation) + by_common @ errors @ by_common.T
     variance = float(noise.variance_at(np.array([e.background]))[0])
     out = []
     for i, (fit, image) in enumerate(zip(e.members, e.images, strict=True)):

@@ -13,7 +13,7 @@ SIDE, CELLS = 640, 4
 
 
 def film_of_pins(
-    rng: np.random.Generator, *, taper: float | None = None, base: Float | float = 0.6, bright: bool = False
+    rng: np.random.Generator, *, taper: float | None = None, base: Float | float = 0.6, bright: bool = False, slope: float = 0.0
 ) -> tuple[np.ndarray, Float, Float]:
     """Sixteen pins of 0.5 x 2 mm in all directions, exact chords; tips and directions away from them, both (n, 2), (col, row)."""
     clear = np.ones((SIDE, SIDE))
@@ -26,7 +26,8 @@ def film_of_pins(
         corner = tip.astype(int) - half
         line = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5
         x, y = np.meshgrid(line + corner[0] - tip[0], line + corner[1] - tip[1])
-        origin, down = np.array([x * PITCH_MM, y * PITCH_MM, 0 * x]), np.array([0 * x, 0 * x, 0 * x + 1])
+        lean = slope * rng.uniform(-1, 1, 2) if slope else np.zeros(2)  # of the rays, along columns and rows
+        origin, down = np.array([x * PITCH_MM, y * PITCH_MM, 0 * x]), np.array([0 * x + lean[0], 0 * x + lean[1], 0 * x + 1])
         chord = chord_pin(origin, down, np.zeros(3), np.array([*way, 0.0]), 2.0, 0.25, taper)
         left = np.exp(-MU_PER_MM * chord).reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
         clear[corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= left
@@ -37,7 +38,7 @@ def film_of_pins(
     return np.clip(np.rint(values), 0, 65535).astype(np.uint16), np.array(tips), np.array(ways)
 
 
-@pytest.mark.parametrize("kind", ["cones", "cylinders with a point", "bright", "on a gradient"])
+@pytest.mark.parametrize("kind", ["cones", "cylinders with a point", "bright", "on a gradient", "seen at a slant"])
 def test_finds_all_tips_within_their_stated_errors(kind: str) -> None:
     rng = np.random.default_rng(5)
     gradient = 0.3 + 0.5 * np.arange(SIDE) / SIDE
@@ -46,6 +47,7 @@ def test_finds_all_tips_within_their_stated_errors(kind: str) -> None:
         taper=1.0 if kind.startswith("cyl") else None,
         bright=kind == "bright",
         base=gradient if "gradient" in kind else 0.6,
+        slope=0.4 if "slant" in kind else 0.0,
     )
     found = detect_markers(values, bits=16).images
     assert found.shape.tolist() == ["pin"] * len(tips)
