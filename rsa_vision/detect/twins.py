@@ -18,8 +18,10 @@ from rsa_vision.types import Float
 Judge = Callable[[NeedleFit], bool]
 
 APART_PX = (2.5, 5.0, 8.0)  # separations tried; what is closer than half the first cannot be told apart
+_UNLIKE, _LEAST_UNLIKE = 2.5, 0.03  # misfits that call for a second look: against the film's typical one, and at least
+_BETTER = 0.6  # part of one tee's misfit that two may leave
 _EIGHTHS = np.pi / 4 * np.arange(4)
-_ALIKE = 2.5  # ratio of depths: two images of one kind of mark
+_ALIKE = 4.0  # ratio of depths: images of one kind of mark, with more or less light
 
 
 def split_twins(
@@ -51,15 +53,19 @@ def split_twins(
     clean = [t for t in tees if is_tee(t)]
     if not clean:
         return tees
-    out = list(clean)
+    # two that lie nearly on each other may still pass for one, if not for a good one
+    good = max(_UNLIKE * float(np.median([t.misfit for t in clean])), _LEAST_UNLIKE)
+    out = []
     offsets: list[Float] = []  # twins of one film tend to be apart by the same vector: what worked once is tried first
     for tee in tees:
-        if is_tee(tee):
+        if is_tee(tee) and tee.misfit < good:
+            out.append(tee)
             continue
         model = clean[int(np.argmin([abs(c.shape.length_px - tee.shape.length_px) for c in clean]))]
         pair = _split(film, tee, model, offsets, optics, noise, is_tee, others([tee]))
-        out += pair or [tee]
-        if pair:
+        better = bool(pair) and max(p.misfit * abs(p.depth) for p in pair) < _BETTER * tee.misfit * abs(tee.depth)
+        out += pair if better else [tee]
+        if better:
             offsets.insert(0, pair[1].position_px - pair[0].position_px)
     return out
 
