@@ -18,7 +18,7 @@ from rsa_vision.types import Float
 Judge = Callable[[NeedleFit], bool]
 
 APART_PX = (2.5, 5.0, 8.0)  # separations tried; what is closer than half the first cannot be told apart
-_UNLIKE, _LEAST_UNLIKE = 2.5, 0.03  # misfits that call for a second look: against the film's typical one, and at least
+_UNLIKE, _LEAST_UNLIKE = 2.5, 0.05  # misfits that call for a second look: against the film's typical one, and at least
 _BETTER = 0.6  # part of one tee's misfit that two may leave
 _EIGHTHS = np.pi / 4 * np.arange(4)
 _ALIKE = 4.0  # ratio of depths: images of one kind of mark, with more or less light
