@@ -37,7 +37,7 @@ def draw(tex: str) -> str:
     with mpl.rc_context({"mathtext.fontset": "stix", "svg.fonttype": "path", "svg.hashsalt": "math", "font.size": PT_PER_EM}):
         depth_px = math_to_image(f"${' '.join(tex.split())}$", buffer, format="svg", dpi=72, color="#000000")
     svg = buffer.getvalue().decode()
-    width, height = (float(re.search(rf'{side}="([\d.]+)pt"', svg)[1]) for side in ("width", "height"))  # type: ignore[index]
+    width, height = (float(re.findall(rf'{side}="([\d.]+)pt"', svg)[0]) for side in ("width", "height"))
     body = svg[svg.index("<svg") :]
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     body = re.sub(r'<g id="patch_1">.*?</g>', "", body, flags=re.DOTALL)  # the white ground

@@ -17,7 +17,7 @@ from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
 from rsa_vision.detect.find import CHANCE, MISFIT, ROUNDNESS, STRENGTH, distinct, first_look, fit_at, misfit, plausible, significance_limit
 from rsa_vision.detect.mixed import part
-from rsa_vision.detect.needles import NeedleFit, needle_image
+from rsa_vision.detect.needle_images import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins

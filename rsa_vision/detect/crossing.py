@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import polynomial
-from rsa_vision.detect.needles import Images, NeedleFit, NeedleShape, arm_images, core_pixels, significance_of, support
+from rsa_vision.detect.needle_images import Images, NeedleFit, NeedleShape, arm_images, support
+from rsa_vision.detect.needles import core_pixels, scored
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
@@ -138,45 +139,6 @@ def fit_crossing(
         whole = core_pixels(f.position_px, f.angles, f.shape, optics.sigma_px)
         out.append(scored(fit, f.depths @ block[0], residual, weight, surface, float(theta[-6]), variance, whole))
     return out
-
-
-def scored(
-    fit: NeedleFit, image: Float, residual: Float, weight: Float, surface: Float, background: float, variance: float, whole: int
-) -> NeedleFit:
-    """Return a fit with its figures of merit, taken under its own arms.
-
-    Parameters
-    ----------
-    fit : NeedleFit
-    image, residual, weight : ndarray of shape (n,)
-        Its image, what the fit leaves, one over the variance of a pixel.
-    surface : ndarray of shape (n, p)
-        Columns of the background.
-    background, variance : float
-        Film value, and of the noise there.
-    whole : int
-        Pixels under the arms, were nothing hidden.
-
-    Returns
-    -------
-    NeedleFit
-    """
-    square = weight * residual**2
-    depth = float(fit.depths.mean())
-    core = np.abs(image) > 0.08 * max(float(np.abs(image).max()), 1e-9)
-    chi2_core = float(square[core].mean()) if core.any() else np.inf
-    raised = float((weight * (residual + image) ** 2)[core].sum())
-    return replace(
-        fit,
-        depth=depth,
-        background=background,
-        n_core=int(core.sum()),
-        valid_fraction=min(1.0, int(core.sum()) / max(whole, 1)),
-        chi2_core=chi2_core,
-        explained=1.0 - float(square[core].sum()) / max(raised, 1e-12),
-        misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
-        significance=significance_of(image, surface, weight),
-    )
 
 
 def lapping(shadows: Sequence[Float]) -> list[Float]:

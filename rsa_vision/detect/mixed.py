@@ -14,7 +14,7 @@ from rsa_vision.detect.balls import BallFits, ball_image, polynomial
 from rsa_vision.detect.crossing import fit_crossing
 from rsa_vision.detect.find import plausible
 from rsa_vision.detect.groups import fit_group
-from rsa_vision.detect.needles import NeedleFit, arm_images, needle_image
+from rsa_vision.detect.needle_images import NeedleFit, arm_images, needle_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics

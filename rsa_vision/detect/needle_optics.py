@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.needle_sets import clusters
-from rsa_vision.detect.needles import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared

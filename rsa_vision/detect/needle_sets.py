@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.crossing import fit_crossing
-from rsa_vision.detect.needles import Images, NeedleFit, needle_image
+from rsa_vision.detect.needle_images import Images, NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float

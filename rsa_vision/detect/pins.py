@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
+from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
 from rsa_vision.detect.needle_sets import TAPERS, fit_all
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, explains, fit_needles
+from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared

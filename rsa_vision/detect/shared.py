@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.crossing import Window, between, gain_at, lapping, scored, window_of
+from rsa_vision.detect.crossing import Window, between, gain_at, lapping, window_of
+from rsa_vision.detect.needle_images import NeedleFit, NeedleShape, arm_images
 from rsa_vision.detect.needle_sets import clusters, others_beside
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, arm_images, core_pixels
+from rsa_vision.detect.needles import core_pixels, scored
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
@@ -71,29 +72,25 @@ class _Equations:
         normal = self.own.T @ self.own + np.diag(self.prior**2 + _RIDGE**2)
         return np.asarray(np.linalg.inv(normal), np.float64)
 
-    def to_own(self, target: Float) -> Float:
-        """Own parameters, in units of their scale, that explain a target (n,) or (n, m)."""
-        explained: Float = self.inverse @ (self.own.T @ target)
-        return explained
-
     @cached_property
     def own_by_common(self) -> Float:
-        """What of the own parameters a change of the common ones takes along, shape (p, c), negative."""
-        return self.to_own(self.common)
+        """Change of the own parameters that takes up one of the common ones, shape (p, c), in units of their scale."""
+        return np.asarray(self.inverse @ (self.own.T @ self.common), np.float64)
+
+    @cached_property
+    def own_alone(self) -> Float:
+        """Change of the own parameters, shape (p,), in units of their scale, were the common ones right."""
+        return np.asarray(self.inverse @ (self.own.T @ self.residual + self.prior * self.known), np.float64)
 
     def information(self) -> tuple[Float, Float]:
         """Normal matrix (c, c) and right-hand side (c,) of the common parameters, the own ones eliminated, their priors counted."""
         by_own = self.common.T @ self.own
-        step = self.inverse @ (self.own.T @ self.residual + self.prior * self.known)
-        excess = self.excess
-        return (self.common.T @ self.common - by_own @ self.own_by_common) / excess, (
-            self.common.T @ self.residual - by_own @ step
-        ) / excess
+        matrix, target = self.common.T @ self.common - by_own @ self.own_by_common, self.common.T @ self.residual - by_own @ self.own_alone
+        return matrix / self.excess, target / self.excess
 
     def step(self, change: Float) -> Float:
         """Change of the own parameters, shape (p,), that goes with one of the common ones."""
-        scaled: Float = self.inverse @ (self.own.T @ self.residual + self.prior * self.known) - self.own_by_common @ change
-        return scaled / self.scale
+        return np.asarray((self.own_alone - self.own_by_common @ change) / self.scale, np.float64)
 
     @property
     def tips(self) -> Int:
@@ -106,7 +103,7 @@ class _Equations:
         """Least standard deviation of a tip's coordinate."""
         return float((np.sqrt(self.inverse.diagonal()) / self.scale)[self.tips].min())
 
-    @property
+    @cached_property
     def excess(self) -> float:
         """Chi2 over what noise leaves, at least one."""
         return max(1.0, float(np.mean(self.weight * self.left**2)))

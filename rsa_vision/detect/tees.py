@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from rsa_vision.detect.crossing import fit_crossing
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.junctions import RINGS_PX
+from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
 from rsa_vision.detect.needle_sets import TAPERS, fit_all, others_beside
-from rsa_vision.detect.needles import NeedleFit, NeedleShape, explains, fit_needles
+from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared

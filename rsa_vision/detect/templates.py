@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.needles import NeedleFit, needle_image
+from rsa_vision.detect.needle_images import NeedleFit, needle_image
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.crossing import fit_crossing
-from rsa_vision.detect.needles import NeedleFit
+from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float

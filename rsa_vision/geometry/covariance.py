@@ -17,8 +17,8 @@ SIGNIFICANCE: Final = 0.01  # of residuals that are larger than the stated covar
 ROUNDING: Final = 1e-9  # least standard deviation of an image coordinate, as a fraction of the film: keeps exact input from dividing 0 by 0
 
 
-def birge_factor(residuals: Float, covariance: Float) -> float:
-    """Return the factor by which stated standard deviations are too small (Birge ratio), 1 unless it is significant.
+def residual_ratio(residuals: Float, covariance: Float) -> tuple[float, float]:
+    """Return the sum of squares of residuals over its expectation, and its degrees of freedom; 1 and 0 where nothing is redundant.
 
     Parameters
     ----------
@@ -28,25 +28,8 @@ def birge_factor(residuals: Float, covariance: Float) -> float:
 
     Returns
     -------
-    float
-        Square root of the sum of squares over its expectation, whose distribution is taken as chi-squared with the degrees of freedom
-        that give it the right variance (Satterthwaite).
-    """
-    return pooled_factor([residual_ratio(residuals, covariance)])
-
-
-def residual_ratio(residuals: Float, covariance: Float) -> tuple[float, float]:
-    """Return the sum of squares over its expectation, and its degrees of freedom; 1 and 0 where nothing is redundant.
-
-    Parameters
-    ----------
-    residuals : ndarray of shape (n,)
-    covariance : ndarray of shape (n, n)
-
-    Returns
-    -------
     ratio, freedom : float
-        As of :func:`birge_factor`.
+        The distribution is taken as chi-squared with the degrees of freedom that give it the right variance (Satterthwaite).
     """
     expected = float(np.trace(covariance))
     spread = float((covariance**2).sum())
@@ -56,12 +39,12 @@ def residual_ratio(residuals: Float, covariance: Float) -> tuple[float, float]:
 
 
 def pooled_factor(ratios: Sequence[tuple[float, float]]) -> float:
-    """Return the Birge ratio of several sets of residuals together, 1 unless it is significant.
+    """Return the factor by which stated standard deviations are too small (Birge ratio), 1 unless it is significant.
 
     Parameters
     ----------
     ratios : sequence of (ratio, freedom)
-        As of :func:`residual_ratio`.
+        As of :func:`residual_ratio`, of one set of residuals or of several together.
 
     Returns
     -------

@@ -170,20 +170,14 @@ def cross(a: RayBundle, b: RayBundle) -> tuple[Float, Float, Float]:
     """
     through_a, origin_a = a.through_mm[:, None], a.origin_mm[:, None]
     through_b, origin_b = b.through_mm[None], b.origin_mm[None]
-    point_a, point_b, fraction_a, fraction_b = closest_approach(through_a, origin_a, through_b, origin_b)
-    perpendicular = np.cross(origin_a - through_a, origin_b - through_b)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        perpendicular /= np.linalg.norm(perpendicular, axis=-1, keepdims=True)
-    signed = (perpendicular * (point_b - point_a)).sum(-1)
-    leverage_a = _leverage(perpendicular, fraction_a)
-    leverage_b = _leverage(perpendicular, fraction_b)
+    middle, signed, leverage_a, leverage_b = _crossing(through_a, origin_a, through_b, origin_b)
     variance = ((leverage_a @ a.covariance_mm2) * leverage_a).sum(-1)  # (na, nb, 6) @ (na, 6, 6)
     over_b = leverage_b.swapaxes(0, 1)
     variance += ((over_b @ b.covariance_mm2) * over_b).sum(-1).T
     if a.cage_effect_mm.shape[-1]:
         common = (over_b @ b.cage_effect_mm).swapaxes(0, 1) - leverage_a @ a.cage_effect_mm
         variance += (common**2).sum(-1)
-    return (point_a + point_b) / 2, np.abs(signed), np.sqrt(variance)
+    return middle, np.abs(signed), np.sqrt(variance)
 
 
 def crossing_errors(through_mm: Float, origin_mm: Float, own_mm2: Float, effect_mm: Float) -> tuple[Float, Float, Float]:
@@ -203,17 +197,22 @@ def crossing_errors(through_mm: Float, origin_mm: Float, own_mm2: Float, effect_
     effect_mm : ndarray of shape (n, m)
         As :func:`cross` has them; pairs of parallel rays are left out.
     """
-    (through_a, through_b), (origin_a, origin_b) = through_mm.swapaxes(0, 1), origin_mm.swapaxes(0, 1)
-    point_a, point_b, fraction_a, fraction_b = closest_approach(through_a, origin_a, through_b, origin_b)
-    perpendicular = np.cross(origin_a - through_a, origin_b - through_b)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        perpendicular /= np.linalg.norm(perpendicular, axis=-1, keepdims=True)
-    leverage = np.stack([-_leverage(perpendicular, fraction_a), _leverage(perpendicular, fraction_b)], axis=1)
-    signed = (perpendicular * (point_b - point_a)).sum(-1)
+    _, signed, *leverages = _crossing(through_mm[:, 0], origin_mm[:, 0], through_mm[:, 1], origin_mm[:, 1])
+    leverage = np.stack([-leverages[0], leverages[1]], axis=1)
     variance = np.einsum("nki,nkij,nkj->n", leverage, own_mm2, leverage)
     effect = np.einsum("nki,nkim->nm", leverage, effect_mm)
     known = np.isfinite(signed)
     return signed[known], variance[known], effect[known]
+
+
+def _crossing(through_a: Float, origin_a: Float, through_b: Float, origin_b: Float) -> tuple[Float, Float, Float, Float]:
+    """Midpoints of shortest connections, their signed lengths, and how much (through, origin) of either line moves its end of them."""
+    point_a, point_b, fraction_a, fraction_b = closest_approach(through_a, origin_a, through_b, origin_b)
+    perpendicular = np.cross(origin_a - through_a, origin_b - through_b)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        perpendicular /= np.linalg.norm(perpendicular, axis=-1, keepdims=True)
+    signed = (perpendicular * (point_b - point_a)).sum(-1)
+    return (point_a + point_b) / 2, signed, _leverage(perpendicular, fraction_a), _leverage(perpendicular, fraction_b)
 
 
 def _dot(a: Float, b: Float) -> Float:

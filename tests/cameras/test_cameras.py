@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +39,9 @@ def write(tmp_path: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("change", [lambda t: t, lambda t: t.replace("\n", "\r\n"), lambda t: "\ufeff" + t, lambda t: t.replace(",", ", ")])
-def test_reads(change: object, tmp_path: Path) -> None:
+def test_reads(change: Callable[[str], str], tmp_path: Path) -> None:
     path = tmp_path / "calib.txt"
-    path.write_bytes(change(GOOD).encode())  # type: ignore[operator]
+    path.write_bytes(change(GOOD).encode())
     camera = load_camera(path)
     assert camera.image_size == (1760, 1024)
     np.testing.assert_array_equal(camera.matrix, [[6000.5, 0, 803.25], [0, 6001, 865], [0, 0, 1]])

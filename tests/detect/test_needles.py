@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect.needles import NeedleShape, arm_images
+from rsa_vision.detect.needle_images import NeedleShape, arm_images
 from rsa_vision.detect.profiles import Optics
 from synthetic.chords import chord_pin
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsa_vision.detect.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.tees import is_tee
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rsa_vision.errors import GeometryError
-from rsa_vision.geometry.covariance import birge_factor
+from rsa_vision.geometry.covariance import pooled_factor, residual_ratio
 from rsa_vision.geometry.gross_errors import drop_gross_errors
 
 
@@ -58,8 +58,8 @@ def test_birge_factor_is_one_by_chance_and_true_otherwise() -> None:
     root = rng.normal(size=(20, 20))
     covariance = root @ root.T
     draws = root @ rng.normal(size=(20, 2000))
-    false = np.mean([birge_factor(draw, covariance) > 1 for draw in draws.T])
+    false = np.mean([pooled_factor([residual_ratio(draw, covariance)]) > 1 for draw in draws.T])
     assert 0.002 < false < 0.03  # SIGNIFICANCE is 0.01
-    found = [birge_factor(3 * draw, covariance) for draw in draws.T]
+    found = [pooled_factor([residual_ratio(3 * draw, covariance)]) for draw in draws.T]
     assert 2.7 < np.sqrt(np.mean(np.square(found))) < 3.1
-    assert birge_factor(np.ones(4), np.zeros((4, 4))) == 1
+    assert pooled_factor([residual_ratio(np.ones(4), np.zeros((4, 4)))]) == 1
