@@ -217,13 +217,15 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     full = float(2**bits - 1)
     n, m = len(balls.depth), len(tees)
     position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
-    core_n = np.pi * (balls.radius_px + 1) ** 2
     # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
-    excess = np.where(balls.chi2_uneven > 1 + 3 * np.sqrt(2 / core_n), balls.chi2_uneven, 1.0)
+    excess = np.where(balls.chi2_uneven > 1 + CHANCE * noise.scatter(balls.n_core), balls.chi2_uneven, 1.0)
     # structure around a ball that the quadratic background does not hold goes on under it
     excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 1.0))
     covariance = np.concatenate(
-        [balls.covariance[:, :2, :2] * excess[:, None, None], np.array([t.covariance_px2 * _excess(t) for t in tees]).reshape(-1, 2, 2)]
+        [
+            balls.covariance[:, :2, :2] * excess[:, None, None],
+            np.array([t.covariance_px2 * _excess(t, noise) for t in tees]).reshape(-1, 2, 2),
+        ]
     )
     radius = np.concatenate([balls.radius_px, [t.shape.half_width_px for t in tees]])
     depth = np.abs(np.concatenate([balls.depth, [t.depth for t in tees]]))
@@ -248,5 +250,5 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1]))))
 
 
-def _excess(fit: NeedleFit) -> float:
-    return fit.chi2_core if fit.chi2_core > 1 + 3 * np.sqrt(2 / max(fit.n_core, 1)) else 1.0
+def _excess(fit: NeedleFit, noise: NoiseModel) -> float:
+    return fit.chi2_core if fit.chi2_core > 1 + CHANCE * noise.scatter(np.array(fit.n_core)) else 1.0

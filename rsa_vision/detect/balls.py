@@ -16,9 +16,10 @@ RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are wha
 _STEPS = 12
 _REWEIGHTED = (2, 5)  # steps
 _BATCH = 40  # windows that stay in the cache
-COARSE_HALF_PX = 13
+_LARGE_PX = 27  # side of a window of which a first look does not need every pixel
 _CONVERGED_PX = 2e-4
 _MAX_STEP_PX = 0.7
+_RIDGE = 1e-10  # relative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +50,11 @@ class BallFits:
         Of the whole window, but for a constant: minus half the weighted sum of squared residuals.
     background : ndarray of shape (n,)
         Background value at the centre.
+    significance : ndarray of shape (n,)
+        Depth over its standard deviation at the fitted centre and radius: radius and depth of a ball that is small against the blur can
+        stand for each other, so that neither is sure alone; that something is there is. Of a sparse look, what all pixels promise.
+    n_core : ndarray of shape (n,)
+        Pixels under the ball that were looked at.
     converged : ndarray of bool, shape (n,)
     """
 
@@ -64,6 +70,8 @@ class BallFits:
     window_fraction: Float
     log_likelihood: Float
     background: Float
+    significance: Float
+    n_core: Float
     converged: Bool
 
     def rows(self, index: Any) -> BallFits:
@@ -116,6 +124,7 @@ def fit_balls(
     extra: Float | None = None,
     *,
     quick: bool = False,
+    sparse: bool = False,
 ) -> BallFits:
     """Fit a ball in every window.
 
@@ -132,6 +141,8 @@ def fit_balls(
         Images of neighbours, in film values, to be subtracted first.
     quick : bool
         For a first look: a third of the steps, and covariances as if the noise were white.
+    sparse : bool
+        For a first look at much that is nothing: of large windows only every second pixel either way.
 
     Returns
     -------
@@ -142,7 +153,8 @@ def fit_balls(
         part = slice(begin, begin + _BATCH)
         chunk = Patches(patches.values[part], patches.valid[part], patches.corner_px[part])
         more = None if extra is None else extra[part]
-        parts.append(_fit_batch(chunk, start_px[part], start_radius_px[part], sigma_px, mu_px, noise, more, quick))
+        stride = 2 if sparse and patches.size > _LARGE_PX else 1
+        parts.append(_fit_batch(chunk, start_px[part], start_radius_px[part], sigma_px, mu_px, noise, more, quick, stride))
     return join(parts)
 
 
@@ -155,6 +167,7 @@ def _fit_batch(
     noise: NoiseModel,
     extra: Float | None,
     quick: bool,
+    stride: int,
 ) -> BallFits:
     n, size = len(start_px), patches.size
     kind = np.float32 if quick else np.float64  # a first look does with half the memory
@@ -163,8 +176,6 @@ def _fit_batch(
     data = patches.values if extra is None else patches.values - extra
     data = data.reshape(n, -1)
     valid = patches.valid.reshape(n, -1)
-    # a first look at a large window does not need every pixel
-    stride = 2 if quick and half > COARSE_HALF_PX else 1
     axis = np.arange(half % stride, size, stride, dtype=np.float64)
     grid_c, grid_r = (g.ravel() for g in np.meshgrid(axis, axis))
     looked_at = (grid_r * size + grid_c).astype(np.intp)
@@ -185,7 +196,7 @@ def _fit_batch(
     busy = np.arange(n)
     for step in range(4 if quick else _STEPS):
         now, seen, j = weight[busy], data[busy], jac[: len(busy)]
-        value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local[busy], radius[busy], sigma_px, kind)
+        value, dx, dy, slope_r = slopes(table, grid_c - local[busy, :1], grid_r - local[busy, 1:], radius[busy], sigma_px, kind)
         j[:, 3] = value
         if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
             theta = _solve(j[:, 3:], now, seen).astype(kind)
@@ -205,7 +216,7 @@ def _fit_batch(
             break
         if step >= _REWEIGHTED[-1]:
             busy = busy[moving]
-    value, dx, dy, slope_r = _ball(table, grid_c, grid_r, local, radius, sigma_px, kind)
+    value, dx, dy, slope_r = slopes(table, grid_c - local[:, :1], grid_r - local[:, 1:], radius, sigma_px, kind)
     jac[:, 3] = value
     # the rest is added to what is known: no digits are lost in it
     theta = theta + _solve(jac[:, 3:], weight, data - np.matmul(theta[:, None], jac[:, 3:])[:, 0]).astype(kind)
@@ -213,10 +224,13 @@ def _fit_batch(
     jac[:, 0], jac[:, 1], jac[:, 2] = -depth * dx, -depth * dy, depth * slope_r
     residual = data - np.matmul(theta[:, None], jac[:, 3:])[:, 0]
     weighted = jac * np.sqrt(weight, dtype=np.float64)[:, None]
-    covariance = np.linalg.pinv(np.matmul(weighted, weighted.transpose(0, 2, 1)), hermitian=True)[:, :4]
+    normal = np.matmul(weighted, weighted.transpose(0, 2, 1))
+    covariance, of_depth = invert(normal)[:, :4], invert(normal[:, 3:, 3:])[:, :1]
+    variance = of_depth[:, 0, 0] / stride**2
     if not quick:
-        influence = np.matmul(covariance, weighted).reshape(n, 4, size, size)
-        covariance = np.stack([influence_covariance(one, noise.correlation) for one in influence])
+        influence = np.concatenate([np.matmul(covariance, weighted), np.matmul(of_depth, weighted[:, 3:])], axis=1)
+        whole = np.stack([influence_covariance(one, noise.correlation) for one in influence.reshape(n, 5, size, size)])
+        covariance, variance = whole[:, :4], whole[:, 4, 4]
     core = _distance(grid_c - local[:, :1], grid_r - local[:, 1:]) < (radius + sigma_px)[:, None]
     square = weight * residual**2
     core_n = np.maximum((core * valid).sum(1), 1.0)
@@ -238,8 +252,17 @@ def _fit_batch(
         window_fraction=valid.mean(1),
         log_likelihood=-0.5 * square.sum(1),
         background=theta[:, 1] + level[:, 0],
+        significance=np.abs(theta[:, 0]) / np.sqrt(np.maximum(variance, 1e-30)),
+        n_core=core_n,
         converged=converged,
     )
+
+
+def invert(normal: Float) -> Float:
+    """Return the inverses of normal matrices (n, p, p); what they do not determine has a variance that is large, not infinite."""
+    scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
+    both = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.inv(normal / both + _RIDGE * np.eye(normal.shape[1])) / both)
 
 
 def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) -> Float:
@@ -269,10 +292,26 @@ def _distance(dx: Float, dy: Float) -> Float:
     return np.asarray(np.sqrt(dx * dx + dy * dy))  # a fifth of the time of hypot, which minds overflow
 
 
-def _ball(
-    table: BallTable, grid_c: Float, grid_r: Float, local: Float, radius: Float, sigma_px: float, kind: Any
+def slopes(
+    table: BallTable, dx: Float, dy: Float, radius: Float, sigma_px: float, kind: Any = np.float64
 ) -> tuple[Float, Float, Float, Float]:
-    dx, dy = (grid_c - local[:, :1]).astype(kind), (grid_r - local[:, 1:]).astype(kind)
+    """Return the images of balls and their derivatives.
+
+    Parameters
+    ----------
+    table : BallTable
+    dx, dy : ndarray of shape (n, p)
+        Pixels from the centres.
+    radius : ndarray of shape (n,)
+    sigma_px : float
+    kind : dtype, optional
+        Of the result.
+
+    Returns
+    -------
+    value, by_dx, by_dy, by_radius : ndarrays of shape (n, p)
+    """
+    dx, dy = dx.astype(kind), dy.astype(kind)
     rho = _distance(dx, dy)
     value, slope, slope_r = table.evaluate(rho / kind(sigma_px), radius / sigma_px)
     slope /= kind(sigma_px) * np.maximum(rho, kind(1e-9))

@@ -20,13 +20,21 @@ STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real 
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
-CHANCE = 3.0  # standard deviations of the mean square of noise, for which no mark is blamed
+CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
 
 def fit_at(
-    film: NDArray[Any], position_px: Float, radius_px: Float, optics: Optics, noise: NoiseModel, others: Any = None, *, quick: bool = False
+    film: NDArray[Any],
+    position_px: Float,
+    radius_px: Float,
+    optics: Optics,
+    noise: NoiseModel,
+    others: Any = None,
+    *,
+    quick: bool = False,
+    sparse: bool = False,
 ) -> BallFits:
     """Fit balls at these places, in windows that suit their radii.
 
@@ -39,7 +47,7 @@ def fit_at(
     noise : NoiseModel
     others : callable, optional
         ``others(i, cols, rows)``: images of the neighbours of ball ``i`` at these pixels, and where they are not to be trusted.
-    quick : bool
+    quick, sparse : bool
         As of :func:`rsa_vision.detect.balls.fit_balls`.
 
     Returns
@@ -61,7 +69,8 @@ def fit_at(
             ]
             extra = np.stack([image for image, _ in near])
             patches = replace(patches, valid=patches.valid & ~np.stack([doubtful for _, doubtful in near]))
-        parts.append(fit_balls(patches, position_px[index], radius_px[index], optics.sigma_px, optics.mu_px, noise, extra, quick=quick))
+        start = (position_px[index], radius_px[index])
+        parts.append(fit_balls(patches, *start, optics.sigma_px, optics.mu_px, noise, extra, quick=quick, sparse=sparse))
         order.append(index)
     fits = join(parts)
     return fits.rows(np.argsort(np.concatenate(order)))
@@ -73,22 +82,9 @@ def misfit(fits: BallFits, noise: NoiseModel, chance: float = 0.0) -> Float:
     ``chance``: what is within so many standard deviations of the mean square of noise alone does not count.
     """
     excess = np.maximum(fits.chi2_core - 1.0, 0.0)
-    excess = np.where(excess > chance * np.sqrt(2 / (np.pi * (fits.radius_px + 1) ** 2)), excess, 0.0) * noise.variance_at(fits.background)
+    excess = np.where(excess > chance * noise.scatter(fits.n_core), excess, 0.0) * noise.variance_at(fits.background)
     rest: Float = np.sqrt(excess) / np.maximum(np.abs(fits.depth), 1e-9)
     return rest
-
-
-def significance(fits: BallFits) -> Float:
-    """Return depth over its standard deviation at the fitted centre and radius, shape (n,).
-
-    Radius and depth of a ball that is small against the blur can stand for each other, so that neither is sure alone: that something is
-    there is.
-    """
-    scale = np.sqrt(np.maximum(np.einsum("nii->ni", fits.covariance), 1e-30))
-    correlation = fits.covariance / (scale[:, :, None] * scale[:, None, :])
-    precision = np.linalg.pinv(correlation, hermitian=True)[:, 3, 3] / scale[:, 3] ** 2
-    out: Float = np.abs(fits.depth) * np.sqrt(np.maximum(precision, 0.0))
-    return out
 
 
 def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
@@ -108,12 +104,11 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     # little is left of the window beside a saturated area: enough if the ball itself is whole
     seen = ((fits.valid_fraction > 0.3) & (fits.window_fraction > 0.5)) | ((fits.valid_fraction > 0.6) & (fits.window_fraction > 0.05))
     usable = seen & np.isfinite(fits.position_px).all(1)
-    strength = significance(fits)
     # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
     least = 1 - (1 - EXPLAINED) * slack
-    stands_out = strength / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
+    stands_out = fits.significance / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
     explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
-    return usable & (misfit(fits, noise, CHANCE) < MISFIT * slack) & explained & (strength > 5.0)
+    return usable & (misfit(fits, noise, CHANCE) < MISFIT * slack) & explained & (fits.significance > 5.0)
 
 
 def explained_over_noise(fits: BallFits) -> Float:
@@ -141,7 +136,7 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
     if len(candidates.radius_px) == 0:
         return _no_fits()
     guess = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
-    fits = fit_at(film, candidates.position_px, candidates.radius_px, guess, noise, quick=True)
+    fits = fit_at(film, candidates.position_px, candidates.radius_px, guess, noise, quick=True, sparse=True)
     return fits.rows(plausible(fits, noise, slack=2.5))
 
 
@@ -192,4 +187,4 @@ def significance_limit(film_size: int, radius_px: float, false_detections: float
 
 def _no_fits() -> BallFits:
     none = np.zeros(0)
-    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), none, none, none, none, none, none, none, none, np.zeros(0, bool))
+    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), *(none,) * 10, np.zeros(0, bool))

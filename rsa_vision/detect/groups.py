@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, polynomial, uneven
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, invert, polynomial, uneven
 from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
@@ -82,8 +82,8 @@ def fit_group(
         converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
         images = _images(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-9)
-    covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
-    influence = (covariance[: 4 * k] @ (jac * np.sqrt(weight)[:, None]).T).reshape(4 * k, size, size)
+    root = np.sqrt(weight)[:, None]
+    influence = np.concatenate([_estimator(jac * root)[: 4 * k], _estimator(linear * root)[:k]]).reshape(5 * k, size, size)
     whole = influence_covariance(influence, noise.correlation)
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
     core = distance < (radius + sigma_px)[:, None]
@@ -105,8 +105,15 @@ def fit_group(
         window_fraction=np.full(k, valid.mean()),
         log_likelihood=np.full(k, -0.5 * square.sum()),
         background=np.full(k, theta[k]),
+        significance=np.abs(theta[:k]) / np.sqrt(np.maximum(np.diag(whole)[4 * k :], 1e-30)),
+        n_core=inside,
         converged=np.full(k, converged),
     )
+
+
+def _estimator(weighted: Float) -> Float:
+    """Linear estimator (p, n) of the parameters whose weighted derivatives are (n, p)."""
+    return np.asarray(invert((weighted.T @ weighted)[None])[0] @ weighted.T)
 
 
 def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None) -> float:

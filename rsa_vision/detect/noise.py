@@ -48,6 +48,14 @@ class NoiseModel:
         """Return the variance of pixels with these expected values (same shape)."""
         return np.interp(values, self.level, self.variance)
 
+    def scatter(self, pixels: Float) -> Float:
+        """Return the standard deviation of the mean square of the noise in so many pixels beside each other, in units of the variance.
+
+        The variance of a sample variance, with correlated samples (Bartlett, 1946): ``2 / n`` times the sum of the squared correlations.
+        """
+        out: Float = np.sqrt(2 * np.square(self.correlation).sum() / np.maximum(pixels, 1.0))
+        return out
+
     @property
     def typical_sd(self) -> float:
         """Standard deviation of one pixel at the middle of the film's values."""

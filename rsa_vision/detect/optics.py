@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits
-from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, fit_at, misfit, refine, significance
-from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.balls import BallFits, ball_image, invert, polynomial, slopes
+from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, fit_at, misfit, refine
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.patches import cut
+from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.types import Float
 
 SIGMAS_PX = (0.55, 0.75, 1.05, 1.5, 2.1, 2.9)
-NEAR = (0.74, 0.86, 1.0, 1.16, 1.35)  # a second look around the best blur
 KAPPA = 0.5  # attenuation along one blur width while the blur is looked for
-KAPPAS = (0.1, 0.25, 0.5, 1.0, 2.0)
-_MOST_TRIED, _MOST_SEEDS = 40, 16
+# what is expected before the balls are asked, tantalum of 0.5 to 1 mm at 8 per mm and blurs of 0.1 to 0.3 mm: blur over radius,
+# attenuation along a radius (less where film curve or scatter hide it), and the errors of the logarithms of blur and attenuation
+_BLUR, _ATTENUATION, _EXPECTED = 0.4, 2.5, np.array([0.6, 0.8])
+_SIGMA_PX, _KAPPA = (0.4, 4.0), (0.03, 4.0)
+_ROUNDS = 8
+_STEP = 0.05  # of the logarithms, for derivatives
+_MOST_BY_STEP = 0.5
+_SHORTER = 3  # attempts at a step that gains
+_ODD = 6.0  # three times what the two numbers of the optics gain by chance
+_SETTLED = 0.3  # standard deviations
+_MOST_TRIED, _MOST_SEEDS = 40, 40
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
 _CAP = 50.0  # significance beyond which a ball is no better evidence
@@ -27,7 +37,7 @@ def ball_evidence(fits: BallFits, noise: NoiseModel) -> float:
     """Return how much the fits speak for balls: significances, weighted by how closely the model describes each."""
     rest = np.maximum(misfit(fits, noise) / MISFIT, (1 - fits.explained) / (1 - EXPLAINED))
     whole = (fits.valid_fraction > 0.95) & (fits.window_fraction > 0.8)
-    return float((np.minimum(significance(fits), _CAP) * np.exp(-((rest / _SHARP) ** 2)))[whole].sum())
+    return float((np.minimum(fits.significance, _CAP) * np.exp(-((rest / _SHARP) ** 2)))[whole].sum())
 
 
 def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> tuple[Optics, float]:
@@ -69,12 +79,98 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     if not kept.all():
         chosen, position, radius = chosen[kept], position[kept], radius[kept]
         sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen)) for t in trials])
-    kappa = round(refine(KAPPAS, [_cost(fit(sigma, k)) for k in KAPPAS]), 2)
-    near = [sigma * f for f in NEAR]
-    last = [fit(s, kappa) for s in near]
-    sigma = refine(tuple(near), [_cost(t) for t in last])
-    evidence = max(ball_evidence(t, noise) for t in last)
-    return Optics(sigma, kappa / sigma), evidence
+    return _most_likely(film, fit(sigma, KAPPA), Optics(sigma, KAPPA / sigma), noise)
+
+
+def _most_likely(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel) -> tuple[Optics, float]:
+    """Maximise the likelihood of all balls together over blur and attenuation; the evidence for balls comes with it.
+
+    Each ball's own numbers are eliminated first (variable projection; Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973). Its say is
+    divided by what the model leaves of it, as if the variance of each were unknown: bone under it and errors of the model are no noise.
+    """
+    halves = np.ceil(fits.radius_px + 2.5 * optics.sigma_px + 1)
+    fits = fit_at(film, fits.position_px, fits.radius_px, optics, noise, quick=True)
+    first = fits
+    now = _equations(film, fits, first, halves, optics, noise)
+    expected = np.array([[1.0, 0.0], [-1.0, 1.0]]) / _EXPECTED[:, None]
+    for _ in range(_ROUNDS):
+        say = 1 / (np.maximum.reduce([fits.chi2_core, fits.chi2_ring, np.ones(len(halves))]) * now.spread)
+        # Student's weights: what would gain much by optics of its own is none of the film's balls
+        own = np.einsum("ni,nij,nj->n", now.right, invert(now.normal), now.right)
+        say /= 1 + say * own / _ODD
+        normal = np.einsum("n,nij->ij", say, now.normal) + expected.T @ expected
+        step = np.linalg.solve(normal, say @ now.right - expected.T @ _unexpected(optics, fits))
+        step *= min(1.0, _MOST_BY_STEP / float(np.abs(step).max()))
+        expected_before = np.square(_unexpected(optics, fits)).sum()
+        for _ in range(_SHORTER):
+            sigma = float(np.clip(optics.sigma_px * np.exp(step[0]), *_SIGMA_PX))
+            kappa = float(np.clip(optics.mu_px * optics.sigma_px * np.exp(step[1]), *_KAPPA))
+            trial = Optics(sigma, kappa / sigma)
+            moved = fit_at(film, fits.position_px, fits.radius_px, trial, noise, quick=True)
+            then = _equations(film, moved, first, halves, trial, noise)
+            gain = np.clip(say * (now.left - then.left), -_ODD, _ODD)  # a fit that has gone elsewhere does not decide
+            if gain.sum() + expected_before > np.square(_unexpected(trial, moved)).sum():
+                optics, fits, now = trial, moved, then
+                break
+            step = step / 3
+        else:
+            break
+        if (np.abs(step) < _SETTLED * np.sqrt(np.diag(np.linalg.inv(normal)))).all():
+            break
+    return optics, ball_evidence(fits, noise)
+
+
+def _unexpected(optics: Optics, fits: BallFits) -> Float:
+    """Logarithms of blur and attenuation over the expected ones, in units of what is expected of them."""
+    radius = float(np.median(fits.radius_px))
+    return np.asarray(np.log([optics.sigma_px / (_BLUR * radius), optics.mu_px * radius / _ATTENUATION]) / _EXPECTED)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """What balls say of the logarithms of the blur and of the attenuation along its width, each ball's own numbers eliminated."""
+
+    normal: Float  # (n, 2, 2)
+    right: Float  # (n, 2)
+    left: Float  # (n,): squared residuals over the variance
+    spread: Float  # (n,): variance of ``right`` over that of white noise
+
+
+def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Float, optics: Optics, noise: NoiseModel) -> _Equations:
+    """``first``: fits that say which pixels are asked, with which weight: the same all the time, or likelihoods could not be compared."""
+    n, h = len(fits.depth), np.exp(_STEP)
+    sigma, mu = optics.sigma_px, optics.mu_px
+    out = _Equations(np.zeros((n, 2, 2)), np.zeros((n, 2)), np.zeros(n), np.ones(n))
+    for half in np.unique(halves):
+        index = np.nonzero(halves == half)[0]
+        one = fits.rows(index)
+        patches = cut(film, first.position_px[index], int(half), noise)
+        rows, cols = np.mgrid[0 : patches.size, 0 : patches.size].reshape(2, 1, -1).astype(np.float64)
+        dx, dy = (axis - at[:, None] for axis, at in zip((cols, rows), (one.position_px - patches.corner_px).T, strict=True))
+        sides = [
+            ball_image(dx, dy, one.radius_px, s, m) for s, m in ((sigma * h, mu / h), (sigma / h, mu * h), (sigma, mu * h), (sigma, mu / h))
+        ]
+        shared = np.stack([sides[0] - sides[1], sides[2] - sides[3]], 1) / (2 * _STEP)
+        value, by_dx, by_dy, by_radius = slopes(ball_table(round(mu * sigma, 3)), dx, dy, one.radius_px, sigma)
+        surface = polynomial(half, cols[0] - half, rows[0] - half).T
+        depth, background = one.depth[:, None], one.background[:, None]
+        of_ball = np.stack([value, depth * by_dx, depth * by_dy, depth * by_radius], 1)
+        own = np.concatenate([of_ball, np.broadcast_to(surface, (len(index), *surface.shape))], 1)
+        root = np.sqrt(patches.valid.reshape(len(index), -1) / noise.variance_at(first.background[index, None]))
+        target = (root * (patches.values.reshape(len(index), -1) - background - depth * value))[:, :, None]
+        own, shared = own * root[:, None], shared * (depth * root)[:, None]
+        # what a step of its own numbers alone still takes away is none of the others' business
+        inverse = invert(np.matmul(own, own.transpose(0, 2, 1)))
+        target = target - np.matmul(own.transpose(0, 2, 1), np.matmul(inverse, np.matmul(own, target)))
+        of_own = np.matmul(inverse, np.matmul(own, shared.transpose(0, 2, 1)))
+        rest = shared - np.matmul(of_own.transpose(0, 2, 1), own)
+        out.normal[index] = np.matmul(rest, rest.transpose(0, 2, 1))
+        out.right[index] = np.matmul(rest, target)[:, :, 0]
+        out.left[index] = np.square(target).sum((1, 2))
+        windows = rest.reshape(len(index), 2, patches.size, patches.size)
+        scatter = np.stack([influence_covariance(window, noise.correlation) for window in windows])
+        out.spread[index] = 0.5 * np.einsum("nij,nji->n", invert(out.normal[index]), scatter)
+    return out
 
 
 def _closeness(fits: BallFits, noise: NoiseModel) -> Float:

@@ -154,8 +154,9 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
         return np.zeros(len(fits.depth), bool)
     known = known.rows(np.argsort(known.chi2_core)[: max(_LEAST_KNOWN, len(known.depth) // 4)])  # the others may be two themselves
     left = misfit(fits, noise)
-    n = np.pi * (fits.radius_px + 1) ** 2 / np.square(noise.correlation).sum()  # noise that is alike from pixel to pixel says less
-    unlike = (left > _UNLIKE * np.median(misfit(known, noise))) & (left > _LEAST_UNLIKE) & (fits.chi2_core > 1 + 5 * np.sqrt(2 / n))
+    unlike = (
+        (left > _UNLIKE * np.median(misfit(known, noise))) & (left > _LEAST_UNLIKE) & (fits.chi2_core > 1 + 5 * noise.scatter(fits.n_core))
+    )
     return np.asarray(unlike & (fits.radius_px > _LARGER * np.median(known.radius_px)))
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect import Detection, detect_markers
 from rsa_vision.flags import MarkerFlag
 
-from .films import film_of_balls, grid_of_balls, stored
+from .films import ATTENUATION, film_of_balls, grid_of_balls, stored
 
 BAND = (0.85, 1.15)  # observed / stated error; 200 coordinates determine it to 5 %
 BACKGROUND, DEPTH = 30000.0, 0.5
@@ -46,6 +46,21 @@ def test_every_ball_is_found_and_its_stated_error_is_true(cnr: float, noise_blur
     ratio = float(np.sqrt(((error / sd) ** 2).mean()))
     print(f"CNR {cnr}, noise blur {noise_blur_px}: RMS {np.sqrt((error**2).mean()):.4f} px, error / sd {ratio:.2f}")
     assert BAND[0] < ratio < BAND[1]
+
+
+@pytest.mark.parametrize(("cnr", "part"), [(50, 0.04), (20, 0.05), (10, 0.06), (5, 0.12)])
+@pytest.mark.parametrize("sigma_px", [0.8, 1.4])
+def test_blur_and_attenuation_are_those_of_the_film(cnr: float, part: float, sigma_px: float) -> None:
+    rng = np.random.default_rng(int(cnr))
+    truth, radius = grid_of_balls(rng, 6, 64.0, (2.5, 6.0))
+    blobs = rng.uniform(420, 620, (12, 2)), rng.uniform(2.0, 9.0, 12)  # what lies there is no ball of the film's blur
+    balls = film_of_balls((640, 640), truth, radius, depth=DEPTH, sigma_px=sigma_px, noise_sd=DEPTH * BACKGROUND / cnr, rng=rng)
+    soft = film_of_balls((640, 640), *blobs, depth=0.3 * DEPTH, sigma_px=3.5)
+    optics = detect_markers(stored(balls + soft - BACKGROUND), bits=16).optics
+    of_pixels = np.hypot(sigma_px, np.sqrt(1 / 12))  # the pixel's own square blurs too
+    print(f"CNR {cnr}: blur {optics.sigma_px / of_pixels:.3f} of the true one, attenuation {optics.mu_px / ATTENUATION:.2f}")
+    assert optics.sigma_px == pytest.approx(of_pixels, rel=part)
+    assert optics.mu_px == pytest.approx(ATTENUATION, rel=0.5)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
