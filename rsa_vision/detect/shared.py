@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.alike import true_spread
 from rsa_vision.detect.crossing import Window, between, gain_at, lapping, window_of
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape, arm_images
 from rsa_vision.detect.needle_sets import clusters, others_beside
@@ -30,12 +31,14 @@ _FINEST_PX = 0.02  # for the tables are interpolated
 _STEP = 0.05  # of the logarithms of attenuation and blur, and of the taper, for derivatives
 _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
 _TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
-_SHARED = 3  # attenuation, blur, taper
+_OPTICS, _SHARED = 3, 5  # attenuation, blur, taper; then logarithms of half width and length
+_SIZE_ERROR = 1.0  # of those, before
+_SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
 _MUCH = 0.15  # of the logarithms, from which derivatives by them are taken anew
 _MOST_BY_STEP = 0.6  # of all these
-_SLANT, _SKEW = 0.2, 0.1  # expected sizes: rays cross a film at slopes of up to a half
+_SLANT, _SKEW = 0.11, 0.08  # root mean squares, of a square and a product of slopes: rays cross a film at slopes of up to a half
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 # slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
 _OF_SLANTS = {
@@ -99,6 +102,13 @@ class _Equations:
         return np.add.outer(each * np.arange(len(self.members)), [0, 1]).ravel()
 
     @property
+    def variance_of_sizes(self) -> Float:
+        """Variances of half widths and lengths, shape (members, 2)."""
+        each = _own_parameters(len(self.members[0].angles), self.parallel)
+        at = np.add.outer(each * np.arange(len(self.members)), [2, 3])
+        return np.asarray(self.excess * (self.inverse.diagonal() / self.scale**2)[at], np.float64)
+
+    @property
     def sharpest_px(self) -> float:
         """Least standard deviation of a tip's coordinate."""
         return float((np.sqrt(self.inverse.diagonal()) / self.scale)[self.tips].min())
@@ -138,32 +148,39 @@ def fit_shared(
     parallel = parallel and len(needles[0].angles) > 1
     sets = clusters(needles)
     windows = [_window(film, members, needles, optics, noise) for members in sets]
-    before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR]
+    before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, _SIZE_ERROR, _SIZE_ERROR]
     precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     moved = np.zeros(len(precision))
     start, taper = optics, needles[0].shape.taper
     slopes: list[list[Float]] = []
-    since = np.full(_SHARED, np.inf)
+    since = np.full(_OPTICS, np.inf)
+    sizes = _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     converged = False
     for step in range(steps + 1):
-        if np.abs(moved[:_SHARED] - since).max() > _MUCH:
-            slopes, since = [_by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:_SHARED].copy()
-        systems = [_linearise(w, m, k, optics, noise, parallel) for w, m, k in zip(windows, sets, slopes, strict=True)]
+        if np.abs(moved[:_OPTICS] - since).max() > _MUCH:
+            slopes, since = [_by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:_OPTICS].copy()
+        systems = [
+            _linearise(w, m, k, optics, noise, parallel, sizes.typical, spread)
+            for w, m, k, spread in zip(windows, sets, slopes, sizes.spread, strict=True)
+        ]
         told = [e.information() for e in systems]
         normal = precision + sum(matrix for matrix, _ in told)
         if step == steps or converged:
             break
         change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
-        if np.abs(change[:_SHARED]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
-            change[:_SHARED] = 0.0  # new tables for so little are not worth their time
+        if np.abs(change[:_OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
+            change[:_OPTICS] = 0.0  # new tables for so little are not worth their time
         moved += change
         taper += change[2]
         optics = replace(start, mu_px=start.mu_px * float(np.exp(moved[0])), sigma_px=start.sigma_px * float(np.exp(moved[1])))
         furthest = 0.0
         for i, e in enumerate(systems):
-            sets[i], shift = _moved(e.members, e.step(change), change[_SHARED:], taper, parallel)
+            sets[i], shift = _moved(e.members, e.step(change), change, taper, parallel)
             furthest = max(furthest, shift / max(e.sharpest_px, _FINEST_PX))
         converged = step > 0 and furthest < _CONVERGED
+        sizes = replace(sizes, typical=sizes.typical + change[_OPTICS:_SHARED])
+        if step + 1 == _SIZES_AFTER and len(needles[0].angles) == 1:  # where arms cross does not depend on where they end
+            sizes, converged = _sizes(systems, sets), False
     errors = _common_errors(windows, systems, normal, precision, noise)
     out = []
     for window, e in zip(windows, systems, strict=True):
@@ -208,8 +225,33 @@ def _by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list
     return out
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sizes:
+    """Logarithms of half width and length that are usual on a film, and what each needle may differ from them, by sets (m, 2)."""
+
+    typical: Float
+    spread: list[Float]
+
+
+def _sizes(systems: list[_Equations], sets: list[list[NeedleFit]]) -> _Sizes:
+    """What fits with sizes of their own tell of the sizes: pins of one cage are alike, but for how the rays meet them."""
+    size = np.array([[f.shape.half_width_px, f.shape.length_px] for members in sets for f in members])
+    variance = np.concatenate([e.variance_of_sizes for e in systems]) / size**2
+    values = np.log(size)
+    told = [true_spread(values[:, k], variance[:, k]) for k in range(2)]
+    spread = np.stack([np.where(belongs, sd, np.inf) for _, sd, belongs in told], axis=1)
+    return _Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
+
+
 def _linearise(
-    window: Window, members: list[NeedleFit], slopes: list[Float], optics: Optics, noise: NoiseModel, parallel: bool
+    window: Window,
+    members: list[NeedleFit],
+    slopes: list[Float],
+    optics: Optics,
+    noise: NoiseModel,
+    parallel: bool,
+    typical: Float,
+    spread: Float,
 ) -> _Equations:
     blocks = [_arms(window, f, optics) for f in members]
     # a first background for the gain; the next round has a better one
@@ -231,18 +273,25 @@ def _linearise(
     of_slants = _OF_SLANTS[arms]
     expected = np.array([*[_SLANT] * (of_slants.shape[1] - 1), _SKEW])
     moves, common, priors, known = [], np.zeros((_SHARED + (arms - 1) * parallel, len(weight))), [], []
-    for f, (_, d_col, d_row, d_w, d_l, d_angle, d_slant, d_skew), slope in zip(now, blocks, slopes, strict=True):
+    for f, (_, d_col, d_row, d_w, d_l, d_angle, d_slant, d_skew), slope, differs in zip(now, blocks, slopes, spread, strict=True):
+        size = np.array([f.shape.half_width_px, f.shape.length_px])
         turns = f.depths[:, None] * d_angle
         slants = np.zeros((2, arms)) if f.slants is None else f.slants
         by_ends = (f.depths[:, None] * np.array([d_slant, d_skew])).reshape(2 * arms, -1)
         moves += [(f.depths @ d)[None] for d in (d_col, d_row, d_w, d_l)]
         moves += [turns.sum(0, keepdims=True) if parallel else turns, of_slants.T @ by_ends]
-        common[:_SHARED] += f.depths @ slope
+        common[:_OPTICS] += f.depths @ slope
+        common[_OPTICS:_SHARED] += [size[0] * (f.depths @ d_w), size[1] * (f.depths @ d_l)]
         if parallel:
             common[_SHARED:] += turns[1:]
-        start = np.zeros(4 + (1 if parallel else arms))
-        priors += [start, 1 / expected]
-        known += [start, -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected]
+        turning = np.zeros(1 if parallel else arms)
+        priors += [np.zeros(2), 1 / (differs * size), turning, 1 / expected]
+        known += [
+            np.zeros(2),
+            (typical - np.log(size)) / differs,
+            turning,
+            -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected,
+        ]
     root = np.sqrt(weight)
     jac = np.concatenate([*moves, linear.T]).T * root[:, None]
     scale = np.maximum(np.linalg.norm(jac, axis=0), 1e-12)
@@ -270,9 +319,10 @@ def _own_parameters(arms: int, parallel: bool) -> int:
     return 4 + (1 if parallel else arms) + int(_OF_SLANTS[arms].shape[1])
 
 
-def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, taper: float, parallel: bool) -> tuple[list[NeedleFit], float]:
-    """Needles after a step of their own parameters and of the common directions, and how far the furthest tip went."""
+def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> tuple[list[NeedleFit], float]:
+    """Needles after a step of their own parameters and of the common ones, and how far the furthest tip went."""
     arms = len(members[0].angles)
+    wider, longer, turns = *change[_OPTICS:_SHARED], change[_SHARED:]
     turning = 1 if parallel else arms
     each = 4 + turning + _OF_SLANTS[arms].shape[1]
     parts = delta[: each * len(members)].reshape(len(members), each)
@@ -280,8 +330,9 @@ def _moved(members: Sequence[NeedleFit], delta: Float, turns: Float, taper: floa
     scale = min(1.0, 1.0 / max(shift, 1e-9), 0.1 / max(turn, 1e-9))
     out = []
     for f, part in zip(members, scale * parts, strict=True):
-        width = between(f.shape.half_width_px + between(part[2], -0.5, 0.5), 0.6, 0.3 * f.shape.length_px)
-        shape = NeedleShape(width, max(f.shape.length_px + between(part[3], -2.0, 2.0), 3.0), taper)
+        width, length = f.shape.half_width_px, f.shape.length_px
+        width = between(width + between(part[2] + width * wider, -0.5, 0.5), 0.6, 0.3 * length)
+        shape = NeedleShape(width, max(length + between(part[3] + length * longer, -2.0, 2.0), 3.0), taper)
         angles = f.angles + part[4 : 4 + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
         slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (_OF_SLANTS[arms] @ part[4 + turning :]).reshape(2, arms)
         slants = np.clip(slants, [[-_SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
@@ -294,7 +345,10 @@ def _common_errors(windows: list[Window], systems: list[_Equations], normal: Flo
     spread = precision.copy()
     for window, e in zip(windows, systems, strict=True):
         unexplained = e.common - e.own @ e.own_by_common
-        spread += influence_covariance(window.square(unexplained.T), noise.correlation) / e.excess
+        spread += (
+            influence_covariance(window.square(unexplained.T), noise.correlation)
+            + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)
+        ) / e.excess
     inverse = np.linalg.inv(normal)
     covariance: Float = inverse @ spread @ inverse
     return covariance
@@ -304,6 +358,8 @@ def _finished(window: Window, e: _Equations, errors: Float, optics: Optics, nois
     to_tips = (e.inverse @ e.own.T)[e.tips] / e.scale[e.tips, None]
     by_common = (e.own_by_common / e.scale[:, None])[e.tips]
     covariance = influence_covariance(window.square(to_tips), noise.correlation) + by_common @ errors @ by_common.T
+    of_prior = (e.inverse[e.tips] * e.prior) / e.scale[e.tips, None]  # what is held near to the expected is not exactly there
+    covariance = covariance + of_prior @ of_prior.T
     variance = float(noise.variance_at(np.array([e.background]))[0])
     out = []
     for i, (fit, image) in enumerate(zip(e.members, e.images, strict=True)):
