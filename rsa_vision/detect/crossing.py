@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import polynomial
-from rsa_vision.detect.needle_images import Images, NeedleFit, NeedleShape, arm_images, support
+from rsa_vision.detect.needle_images import Images, NeedleFit, NeedleShape, arm_images, needle_image, support
 from rsa_vision.detect.needles import core_pixels, scored
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
@@ -71,6 +71,15 @@ def window_of(film: NDArray[Any], needles: Sequence[NeedleFit], optics: Optics, 
     cols, rows, raw = cols[near], rows[near], patch.values[0][near]
     beside = np.zeros_like(raw) if others is None else others(cols, rows)
     return Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]), corner, patch.size)
+
+
+def chi2_of(window: Window, fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
+    """Return what a fit leaves of a window, depth and background being free: squared residuals over the variance of the noise."""
+    image = needle_image(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit, optics)
+    weight = 1.0 / noise.variance_at(np.full(len(window.data), float(np.median(window.data))))
+    linear = columns([image[None], window.surface.T])
+    left = window.data - linear @ weighted_least_squares(linear, weight, window.data)
+    return float(np.sum(weight * left**2))
 
 
 def fit_crossing(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.crossing import chi2_of, window_of
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.needle_sets import clusters
 from rsa_vision.detect.noise import NoiseModel
@@ -19,7 +20,7 @@ _SAMPLE = 18  # arms that are asked
 _STEPS = 4  # for a first estimate
 
 
-def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> Optics:
+def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> tuple[Optics, float]:
     """Estimate what the images of the cleanest needles have in common.
 
     Parameters
@@ -33,15 +34,26 @@ def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, 
 
     Returns
     -------
-    Optics
+    optics : Optics
+    along_px : float
+        How far the tips may lie elsewhere along their needles, by other bends of the curve that explain the film nearly as well: their
+        root mean square distance, weighted by likelihood.
     """
     alone = [c[0] for c in clusters(needles) if len(c) == 1] or needles
     sample = sorted(alone, key=lambda f: f.misfit)
     sample = sample[: _SAMPLE // len(sample[0].angles)]
-
-    def tried(start: Optics) -> tuple[float, Optics]:
-        fits, found = fit_shared(film, sample, start, noise, parallel=False, steps=_STEPS)
-        return float(np.mean([f.chi2_core for f in fits])), found
-
-    starts = [optics, *(replace(optics, bend=bend) for bend in _BENDS)] if optics.rough else [optics]
-    return min((tried(start) for start in starts), key=lambda item: item[0])[1]
+    if not optics.rough:
+        return fit_shared(film, sample, optics, noise, parallel=False, steps=_STEPS)[1], 0.0
+    places = np.array([f.position_px for f in sample])
+    windows = [window_of(film, [f], optics, noise, None) for f in sample]
+    ways = np.array([[np.cos(f.angles[0]), -np.sin(f.angles[0])] for f in sample])
+    found, left, along = [], [], []
+    for bend in (0.0, *_BENDS):
+        fits, by = fit_shared(film, sample, replace(optics, bend=bend), noise, parallel=False, steps=_STEPS)
+        of = [int(np.hypot(*(places - f.position_px).T).argmin()) for f in fits]
+        found.append(by)
+        left.append(sum(chi2_of(windows[k], f, by, noise) for k, f in zip(of, fits, strict=True)))
+        along.append(np.mean([(f.position_px - places[k]) @ ways[k] for k, f in zip(of, fits, strict=True)]))
+    best = int(np.argmin(left))
+    weight = np.exp(-0.5 * (np.array(left) - left[best]) / float(noise.correlation.sum()))
+    return found[best], float(np.sqrt(np.average((np.array(along) - along[best]) ** 2, weights=weight)))

@@ -170,13 +170,13 @@ def significance_of(image: Float, surface: Float, weight: Float) -> float:
     return float(np.linalg.norm(over - under @ np.linalg.lstsq(under, over, rcond=None)[0]))
 
 
-def explains(fit: NeedleFit, least: float) -> bool:
-    """Say whether a fit explains a part of what is under it: of all, or, where it stands out, of what is more than the noise."""
+def explains(fit: NeedleFit, least: float, stands_out: float = STANDS_OUT) -> bool:
+    """Say whether a fit explains a part of what is under it: of all, or, where it stands out so far, of what is more than the noise."""
     left = fit.chi2_core
     raised = left / max(1.0 - fit.explained, 1e-9)
     over_noise = 1.0 - max(left - 1.0, 0.0) / max(raised - 1.0, 1e-9)
-    stands_out = fit.significance / np.sqrt(max(fit.chi2_ring, 1.0)) > STANDS_OUT
-    return bool(fit.explained > least or (raised > 1.0 and over_noise > least and stands_out))
+    significance = fit.significance / np.sqrt(max(fit.chi2_ring, 1.0))
+    return bool(fit.explained > least or (raised > 1.0 and over_noise > least and significance > stands_out))
 
 
 def core_pixels(tip: Float, angles: Float, shape: NeedleShape, sigma: float) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.crossing import chi2_of, window_of
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
@@ -23,9 +24,11 @@ EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters le
 BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 _MOST_STROKES = 60
 _MOST_IN_VAIN = 20  # strokes in a row that are no pins
-_ROUGH = 0.85  # explained by a first look
+_ROUGH, _STANDS_OUT_ROUGHLY = 0.85, 11.0  # explained by a first look, with guessed optics; its significance
 _SIGNIFICANT = 9.0
 _SURER_THAN_ROD = 12.0  # half the chi2 by which a rod must be worse
+_LEAST_OF_A_KIND = 3  # clear pins from which a film is one of pins: others then need less
+_RATHER_THAN_ROD, _RATHER_THAN_TURNED = 2.5, 7.0
 _ROD = 0.02  # taper of a rod: blunt
 _NEAREST_PX = 3.0
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
@@ -67,7 +70,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
             tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
             fits.append(fit_needles(film, tip, np.array([turn]), start, guess, noise, quick=True))
         best = max(fits, key=lambda f: f.explained)
-        if explains(best, _ROUGH):
+        if explains(best, _ROUGH, _STANDS_OUT_ROUGHLY):
             found.append(best)
             in_vain = 0
         if in_vain == _MOST_IN_VAIN:
@@ -104,7 +107,7 @@ def find_pins(
         return [], optics
     optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
     more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
-    optics = common_optics(film, [f for f in sample + more if is_pin(f)], optics, noise)
+    optics, along_px = common_optics(film, [f for f in sample + more if is_pin(f)], optics, noise)
     sample = [_refit(film, f, optics, noise) for f in sample if is_pin(f)]
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
@@ -112,12 +115,10 @@ def find_pins(
         min((_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes), key=_left)
         for f, shapes in zip(rough, starts, strict=True)
     ]
-    pins = [f for f in _distinct([f for f in pins if is_pin(f)]) if _is_pointed(film, f, optics, noise)]
-    typical = float(np.median([f.shape.length_px for f in pins[:_SAMPLE]])) if pins else 0.0
-    pins = [f for f in pins if 1 / _OF_A_KIND < f.shape.length_px / typical < _OF_A_KIND]
+    pins = _pointed(film, _distinct([f for f in pins if is_pin(f)]), optics, noise)
     pins = [f for f in fit_all(film, pins, optics, noise, again=True) if is_pin(f)]
-    pins, optics = fit_shared(film, pins, optics, noise, parallel=False)
-    return [_with_error_of_point(f) for f in pins if is_pin(f)], optics
+    pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
+    return [_less_sure_along(f, np.hypot(along_px, _POINT * f.shape.half_width_px)) for f in pins if is_pin(f)], optics
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
@@ -195,15 +196,45 @@ def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel
     return fit_needles(film, fit.position_px, fit.angles, fit.shape, optics, noise)
 
 
-def _is_pointed(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> bool:
-    """Say whether a rod of free length, width and direction in the pin's place explains clearly less."""
+def _pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Keep what is no rod; where noise hides the points of some, those of their kind tell that they are pins."""
+    surer = [_surer_than_rod(film, f, optics, noise) for f in pins]
+    clear = [f for f, by in zip(pins, surer, strict=True) if by > _SURER_THAN_ROD]
+    typical = float(np.median([f.shape.length_px for f in clear[:_SAMPLE]])) if clear else np.nan
+    clear = [f for f in clear if _of_a_kind(f, typical)]
+    if len(clear) < _LEAST_OF_A_KIND:
+        return clear
+    for fit, by in zip(pins, surer, strict=True):
+        if by <= _SURER_THAN_ROD:
+            ways = [fit, _refit(film, _turned(fit), optics, noise)]
+            best, other = sorted(ways, key=_left)
+            rather = is_pin(best) and _of_a_kind(best, typical) and _worse_by(film, best, other, optics, noise) > _RATHER_THAN_TURNED
+            clear += [best] if rather and _surer_than_rod(film, best, optics, noise) > _RATHER_THAN_ROD else []
+    return clear
+
+
+def _of_a_kind(fit: NeedleFit, typical_px: float) -> bool:
+    return 1 / _OF_A_KIND < fit.shape.length_px / typical_px < _OF_A_KIND
+
+
+def _turned(fit: NeedleFit) -> NeedleFit:
+    """The same pin the other way round."""
+    way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
+    return replace(fit, position_px=fit.position_px + fit.shape.length_px * way, angles=fit.angles + np.pi)
+
+
+def _surer_than_rod(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
+    """Return half the chi2 by which a rod of free length, width and direction in the pin's place is worse."""
     thinner = replace(fit.shape, taper=_ROD, half_width_px=0.7 * fit.shape.half_width_px, length_px=0.8 * fit.shape.length_px)
     back = fit.position_px + 0.2 * fit.shape.length_px * np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
-    rod = fit_needles(film, back, fit.angles, thinner, optics, noise)
-    # where both fit equally the misfits are the same: compare what is left under the pin
-    left, left_by_rod = (1 - f.explained for f in (fit, rod))
-    raised = fit.chi2_core * fit.n_core / max(left, 1e-9)
-    return bool((left_by_rod - left) * raised / max(fit.chi2_core, 1.0) > 2 * _SURER_THAN_ROD)
+    return _worse_by(film, fit, fit_needles(film, back, fit.angles, thinner, optics, noise), optics, noise)
+
+
+def _worse_by(film: NDArray[Any], fit: NeedleFit, other: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
+    """Return half the chi2 by which another fit in the place of one is worse, on the same pixels."""
+    window = window_of(film, [fit], optics, noise, None)
+    left, left_by_other = (chi2_of(window, f, optics, noise) for f in (fit, other))
+    return 0.5 * (left_by_other - left) / max(left / len(window.data), 1.0)
 
 
 def _proportion(pins: list[NeedleFit]) -> float:
@@ -217,10 +248,10 @@ def _proportion(pins: list[NeedleFit]) -> float:
     return float((b @ d + 0.5 * ratio / slack**2) / (b @ b + 1 / slack**2))
 
 
-def _with_error_of_point(fit: NeedleFit) -> NeedleFit:
-    """Add what the point's deviation from a cone does along the pin; across it there is nothing that it could move."""
+def _less_sure_along(fit: NeedleFit, error_px: float) -> NeedleFit:
+    """Add an error along the pin: of the film curve, of a point that is no cone; across it there is nothing that they could move."""
     way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
-    return replace(fit, covariance_px2=fit.covariance_px2 + (_POINT * fit.shape.half_width_px) ** 2 * np.outer(way, way))
+    return replace(fit, covariance_px2=fit.covariance_px2 + error_px**2 * np.outer(way, way))
 
 
 def _left(fit: NeedleFit) -> float:

@@ -120,7 +120,14 @@ class _Equations:
 
 
 def fit_shared(
-    film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, parallel: bool, steps: int = _STEPS
+    film: NDArray[Any],
+    needles: list[NeedleFit],
+    optics: Optics,
+    noise: NoiseModel,
+    *,
+    parallel: bool,
+    alike: bool = False,
+    steps: int = _STEPS,
 ) -> tuple[list[NeedleFit], Optics]:
     """Fit all needles of a film and their common attenuation, blur and directions.
 
@@ -134,6 +141,8 @@ def fit_shared(
     noise : NoiseModel
     parallel : bool
         The arms of all needles have the same directions against their first; else each arm its own.
+    alike : bool
+        Their sizes differ as little as fits with free sizes show: for pins, whose tips depend on where they end.
     steps : int
         At the most.
 
@@ -179,7 +188,7 @@ def fit_shared(
             furthest = max(furthest, shift / max(e.sharpest_px, _FINEST_PX))
         converged = step > 0 and furthest < _CONVERGED
         sizes = replace(sizes, typical=sizes.typical + change[_OPTICS:_SHARED])
-        if step + 1 == _SIZES_AFTER and len(needles[0].angles) == 1:  # where arms cross does not depend on where they end
+        if alike and step + 1 == _SIZES_AFTER:
             sizes, converged = _sizes(systems, sets), False
     errors = _common_errors(windows, systems, normal, precision, noise)
     out = []
