@@ -23,6 +23,7 @@ from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
+from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
@@ -80,11 +81,12 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     Detection
     """
     noise = estimate_noise(values, bits)
-    candidates = find_candidates(values, STRENGTH, noise)
+    faint = find_candidates(values, STRENGTH, noise)
+    candidates = faint.rows(np.abs(faint.strength) > STRENGTH)
     pins = look_for_pins(values, candidates.strokes, noise)
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
-        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, noise, false_detections)
+        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, noise, false_detections)
         for sign, optics in _polarities(values, signs, seeds, pins, candidates, noise)
     ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
@@ -145,6 +147,7 @@ def _one_polarity(
     seeds: BallFits,
     rough_pins: list[NeedleFit],
     candidates: Candidates,
+    faint: Candidates,
     noise: NoiseModel,
     false_detections: float,
 ) -> tuple[float, Detection]:
@@ -172,6 +175,11 @@ def _one_polarity(
     limit = significance_limit(film.size, 2.5, false_detections)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching = balls.rows(keep), touching[keep]
+    more = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needle_images if needles else None)
+    both = join([balls, more])
+    like = are_balls(both, limit, optics.sigma_px, noise)[len(balls.depth) :]
+    more = more.rows(like & (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins))
+    balls, touching = join([balls, more]), np.append(touching, np.zeros(len(more.depth), bool))
     for fit in doubtful:
         if found := part(film, fit, balls, optics, tee_optics, noise, needle_images, is_tee):
             tee, ball = found

@@ -23,6 +23,7 @@ MARGIN = 128  # overlap of bands; more than the reach of the coarsest filter
 BLOCK = 32  # side of the blocks of one pyramid level over which the spread is measured
 # (pyramid level, inner sigma, outer sigma in pixels of that level, radius in film pixels that answers best)
 SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
+FAINT = 0.8  # of what counts as significant: extrema of so much are listed too, for looks that know what they look for
 ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
 JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for
 STROKE_SCALES = ((1, 2.6), (1, 4.4))  # those for single pins
@@ -68,7 +69,7 @@ def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> 
     ----------
     film : ndarray of shape (rows, cols)
     threshold : float
-        Least strength, in units of the local spread.
+        Strength that counts, in units of the local spread; extrema down to ``FAINT`` of it are listed.
     noise : NoiseModel
         Its smallest variance is what the spread is at least taken for: saturated and blank areas have none of their own.
 
@@ -117,7 +118,7 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
             (answer.shape[1], answer.shape[0]),
             interpolation=cv2.INTER_LINEAR,
         )
-        out.append(_extrema(answer, limit, level, radius, threshold))
+        out.append(_extrema(answer, FAINT * limit, level, radius, FAINT * threshold))
         if (level, radius) == JUNCTION_SCALE:
             junctions = find_junctions(answer, limit, level)
         if (level, radius) in STROKE_SCALES:

@@ -206,6 +206,11 @@ def _beside(known: BallFits, members: Int, optics: Optics, tees: Background | No
     return lambda cols, rows: _images(known, members, optics, tees, cols, rows)[0]
 
 
+def beside_balls(known: BallFits, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
+    """Return the images of the tees and of known balls at these pixels, and the pixels well under one of those balls."""
+    return _images(known, np.arange(0), optics, tees, cols, rows)
+
+
 def _images(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
     """Images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
     total = np.zeros(cols.shape) if tees is None else tees(cols, rows)

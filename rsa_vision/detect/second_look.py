@@ -1,0 +1,74 @@
+"""Balls that a first look missed: where the film's balls are known, one like them is looked for at every candidate left over.
+
+A first look starts from the size that the filter suits and from guessed optics. Beside an edge, or faint on bone, it grows until it holds
+the bone as well; started from the usual size it stays with the ball.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.candidates import Candidates
+from rsa_vision.detect.decide import over_clutter
+from rsa_vision.detect.find import distinct, fit_at, plausible
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.resolve import Background, beside_balls, inside
+from rsa_vision.types import Bool, Float
+
+_LEAST = 3  # balls that tell what one of them is like
+_CLEAR = 0.9  # of the limit, over clutter
+_SCALE, _SIZE = 2.0, 1.6  # ratios of the filter's radius and of the fitted one to the usual one
+
+
+def look_again(
+    film: NDArray[Any], candidates: Candidates, balls: BallFits, limit: float, optics: Optics, noise: NoiseModel, needles: Background | None
+) -> BallFits:
+    """Fit balls of the usual size at the candidates where none was found.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    candidates : Candidates
+        Of the markers' polarity.
+    balls : BallFits
+        Found so far.
+    limit : float
+        Significance that noise alone would exceed too often.
+    optics : Optics
+    noise : NoiseModel
+    needles : callable, optional
+        Images of pins and tees.
+
+    Returns
+    -------
+    BallFits
+        What may be balls, beside those found so far.
+    """
+    none = balls.rows(np.zeros(len(balls.depth), bool))
+    if len(balls.depth) < _LEAST:
+        return none
+    usual = float(np.median(balls.radius_px))
+    fitting = np.abs(np.log(candidates.radius_px / usual)) < np.log(_SCALE)
+    place = candidates.position_px[fitting & ~_near(candidates.position_px, balls, usual)]
+
+    def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+        return beside_balls(balls, optics, needles, cols, rows)
+
+    for quick in (True, False):
+        if len(place) == 0:
+            return none
+        fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick)
+        stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
+        fits = distinct(fits.rows(stays & plausible(fits, noise) & (over_clutter(fits) > _CLEAR * limit)), noise)
+        place = fits.position_px
+    return fits
+
+
+def _near(position_px: Float, balls: BallFits, radius_px: float) -> Bool:
+    gap = np.hypot(*(position_px[:, None] - balls.position_px[None]).transpose(2, 0, 1))
+    return np.asarray((gap < np.maximum(radius_px, balls.radius_px)).any(axis=1))
