@@ -32,6 +32,8 @@ __all__ = ["Detection", "detect_markers"]
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
+_ENOUGH_BALLS = 8  # that tell the noise under them
+_LEAST_UNDER, _MOST_UNDER, _NEARLY_WHITE = 0.4, 2.5, 1.1  # what they may tell; sum of the noise's correlations
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls; then less than either of the next is no rival
@@ -226,9 +228,10 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     n, m = len(balls.depth), len(tees)
     position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
     # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
-    excess = np.where(balls.chi2_uneven > 1 + CHANCE * noise.scatter(balls.n_core), balls.chi2_uneven, 1.0)
+    usual = _noise_under(balls, touching, noise)
+    excess = np.where(balls.chi2_uneven > usual * (1 + CHANCE * noise.scatter(balls.n_core)), balls.chi2_uneven, usual)
     # structure around a ball that the quadratic background does not hold goes on under it
-    excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 1.0))
+    excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0))
     covariance = np.concatenate(
         [
             balls.covariance[:, :2, :2] * excess[:, None, None],
@@ -256,6 +259,20 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, snr, flags)
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1]))))
+
+
+def _noise_under(balls: BallFits, touching: Bool, noise: NoiseModel) -> float:
+    """Variance under a film's balls in units of that beside them, from what all of them leave together.
+
+    The film's values under marks occur nowhere else, so that no tile tells their noise: quanta are fewer there, the slope of the film curve
+    is another, and bone goes on. Of the residuals only the odd part counts, which the model's own errors do not have.
+    """
+    clear = ~touching & (balls.valid_fraction > 0.999) & (balls.chi2_ring < STRUCTURE)
+    if np.count_nonzero(clear) < _ENOUGH_BALLS:
+        return 1.0
+    # of noise that neighbours share a fit takes a part with it, more than parameters: less is left than there was
+    least = _LEAST_UNDER if noise.correlation.sum() < _NEARLY_WHITE else 1.0
+    return float(np.clip(np.median(balls.chi2_uneven[clear]), least, _MOST_UNDER))
 
 
 def _excess(fit: NeedleFit, noise: NoiseModel) -> float:
