@@ -80,11 +80,12 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     Detection
     """
     noise = estimate_noise(values, bits)
+    limit = significance_limit(values.size, 2.5, false_detections)
     candidates = find_candidates(values, STRENGTH, noise)
     pins = look_for_pins(values, candidates.strokes, noise)
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
-        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, noise, false_detections)
+        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, noise, limit)
         for sign, optics in _polarities(values, signs, seeds, pins, candidates, noise)
     ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
@@ -146,7 +147,7 @@ def _one_polarity(
     rough_pins: list[NeedleFit],
     candidates: Candidates,
     noise: NoiseModel,
-    false_detections: float,
+    limit: float,
 ) -> tuple[float, Detection]:
     seeds = seeds.rows(np.sign(seeds.depth) == sign)
     junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
@@ -168,8 +169,7 @@ def _one_polarity(
                 total += needle_image(dx, dy, t, seen).reshape(cols.shape)
         return total
 
-    balls, touching = resolve_balls(film, mine, seeds, optics, noise, needle_images if needles else None)
-    limit = significance_limit(film.size, 2.5, false_detections)
+    balls, touching = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching = balls.rows(keep), touching[keep]
     for fit in doubtful:
