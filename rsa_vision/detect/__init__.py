@@ -33,7 +33,7 @@ STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which the
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
-_BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls; then less than either of the next is no rival
+_BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _CAP = 50.0  # significance beyond which a needle is no better evidence
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
@@ -105,9 +105,11 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
     looks = {this: look(index) for this, index in strongest.items()}
     evidence = {this: ball_evidence(distinct(fits, noise), noise) for this, fits in looks.items()}
     best = max(evidence, key=lambda this: evidence[this])
-    of_needles = sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == -best) + _of_tees(candidates, -best)
+    needles = {
+        this: sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == this) + _of_tees(candidates, this) for this in looks
+    }
     rest = ~np.isin(np.arange(len(sign)), np.concatenate(list(strongest.values())))
-    if evidence[best] > _BEYOND_DOUBT and evidence[-best] < _NO_RIVAL and of_needles < _NO_RIVAL_OF_NEEDLES:
+    if evidence[best] + needles[best] > _BEYOND_DOUBT and evidence[-best] < _NO_RIVAL and needles[-best] < _NO_RIVAL_OF_NEEDLES:
         del looks[-best]
         rest &= sign == best
     return distinct(join([*looks.values(), look(rest)]), noise), list(looks)
