@@ -36,7 +36,7 @@ _ENOUGH_BALLS = 8  # that tell the noise under them
 _LEAST_UNDER, _MOST_UNDER, _NEARLY_WHITE = 0.4, 2.5, 1.1  # what they may tell; sum of the noise's correlations
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
-_BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls; then less than either of the next is no rival
+_BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _CAP = 50.0  # significance beyond which a needle is no better evidence
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
@@ -83,12 +83,13 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     Detection
     """
     noise = estimate_noise(values, bits)
+    limit = significance_limit(values.size, 2.5, false_detections)
     faint = find_candidates(values, STRENGTH, noise)
     candidates = faint.rows(np.abs(faint.strength) > STRENGTH)
     pins = look_for_pins(values, candidates.strokes, noise)
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
-        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, noise, false_detections)
+        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, noise, limit)
         for sign, optics in _polarities(values, signs, seeds, pins, candidates, noise)
     ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
@@ -108,9 +109,11 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
     looks = {this: look(index) for this, index in strongest.items()}
     evidence = {this: ball_evidence(distinct(fits, noise), noise) for this, fits in looks.items()}
     best = max(evidence, key=lambda this: evidence[this])
-    of_needles = sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == -best) + _of_tees(candidates, -best)
+    needles = {
+        this: sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == this) + _of_tees(candidates, this) for this in looks
+    }
     rest = ~np.isin(np.arange(len(sign)), np.concatenate(list(strongest.values())))
-    if evidence[best] > _BEYOND_DOUBT and evidence[-best] < _NO_RIVAL and of_needles < _NO_RIVAL_OF_NEEDLES:
+    if evidence[best] + needles[best] > _BEYOND_DOUBT and evidence[-best] < _NO_RIVAL and needles[-best] < _NO_RIVAL_OF_NEEDLES:
         del looks[-best]
         rest &= sign == best
     return distinct(join([*looks.values(), look(rest)]), noise), list(looks)
@@ -151,7 +154,7 @@ def _one_polarity(
     candidates: Candidates,
     faint: Candidates,
     noise: NoiseModel,
-    false_detections: float,
+    limit: float,
 ) -> tuple[float, Detection]:
     seeds = seeds.rows(np.sign(seeds.depth) == sign)
     junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
@@ -173,8 +176,7 @@ def _one_polarity(
                 total += needle_image(dx, dy, t, seen).reshape(cols.shape)
         return total
 
-    balls, touching = resolve_balls(film, mine, seeds, optics, noise, needle_images if needles else None)
-    limit = significance_limit(film.size, 2.5, false_detections)
+    balls, touching = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching = balls.rows(keep), touching[keep]
     more = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needle_images if needles else None)

@@ -189,48 +189,46 @@ def _fit_batch(
     low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px, half - sigma_px)
     radius = np.clip(start_radius_px, low, high)
     weight = valid / noise.variance_at(level).astype(kind)
-    jac = np.empty((n, 10, len(grid_c)), kind)  # derivatives by col, row, radius, depth and the background's coefficients
-    jac[:, 4:] = surface.T
-    theta = np.zeros((n, 7), kind)
+    squares = (surface[:, :, None] * surface[:, None]).reshape(len(surface), -1)
+    equations = _Equations(table, sigma_px, grid_c.astype(kind), grid_r.astype(kind), surface, squares)
+    theta = np.zeros((n, 7))
     converged = np.zeros(n, bool)
     busy = np.arange(n)
     for step in range(4 if quick else _STEPS):
-        now, seen, j = weight[busy], data[busy], jac[: len(busy)]
-        value, dx, dy, slope_r = slopes(table, grid_c - local[busy, :1], grid_r - local[busy, 1:], radius[busy], sigma_px, kind)
-        j[:, 3] = value
-        if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
-            theta = _solve(j[:, 3:], now, seen).astype(kind)
-        depth = theta[busy, :1]
-        j[:, 0], j[:, 1], j[:, 2] = -depth * dx, -depth * dy, depth * slope_r
-        model = np.matmul(theta[busy, None], j[:, 3:])[:, 0]
+        now, seen = weight[busy], data[busy]
+        images = equations.images(local[busy], radius[busy])
         if step in _REWEIGHTED:  # the variance follows the expected value once the model is near
+            model = _model(images, surface, theta[busy])
             now = weight[busy] = valid[busy] / noise.variance_at(model + added[busy]).astype(kind)
-        delta = _solve(j, now, seen - model, damping=1e-6)
+        normal, right = equations.normal(images, now, seen)
+        if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
+            theta = _solve(normal[:, 3:, 3:], right[:, 3:])
+        right = right - np.matmul(normal[:, :, 3:], theta[busy, :, None])[:, :, 0]  # of what the model leaves
+        delta = _solve(normal, right, damping=1e-6) / _by_depth(theta[busy])
         scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(delta[:, :3]).max(1), 1e-12))[:, None]
         local[busy] = np.clip(local[busy] + scale * delta[:, :2], 1.0, size - 2.0)
         radius[busy] = np.clip(radius[busy] + (scale * delta[:, 2:3])[:, 0], low, high)
-        theta[busy] += (scale * delta[:, 3:]).astype(kind)
+        theta[busy] += scale * delta[:, 3:]
         converged[busy] = np.abs(delta[:, :2]).max(1) < _CONVERGED_PX * 10
         moving = (np.abs(delta[:, :3]) >= _CONVERGED_PX).any(1)
         if not moving.any():
             break
         if step >= _REWEIGHTED[-1]:
             busy = busy[moving]
-    value, dx, dy, slope_r = slopes(table, grid_c - local[:, :1], grid_r - local[:, 1:], radius, sigma_px, kind)
-    jac[:, 3] = value
+    images = equations.images(local, radius)
+    normal, right = equations.normal(images, weight, data)
     # the rest is added to what is known: no digits are lost in it
-    theta = theta + _solve(jac[:, 3:], weight, data - np.matmul(theta[:, None], jac[:, 3:])[:, 0]).astype(kind)
-    depth = theta[:, :1]
-    jac[:, 0], jac[:, 1], jac[:, 2] = -depth * dx, -depth * dy, depth * slope_r
-    residual = data - np.matmul(theta[:, None], jac[:, 3:])[:, 0]
-    weighted = jac * np.sqrt(weight, dtype=np.float64)[:, None]
-    normal = np.matmul(weighted, weighted.transpose(0, 2, 1))
-    covariance, of_depth = invert(normal)[:, :4], invert(normal[:, 3:, 3:])[:, :1]
+    theta = theta + _solve(normal[:, 3:, 3:], right[:, 3:] - np.matmul(normal[:, 3:, 3:], theta[:, :, None])[:, :, 0])
+    residual = data - _model(images, surface, theta)
+    whole, of_depth = invert(normal)[:, :4], invert(normal[:, 3:, 3:])[:, :1]
+    by = _by_depth(theta)
+    covariance = whole / (by[:, :4, None] * by[:, None])
     variance = of_depth[:, 0, 0] / stride**2
     if not quick:
-        influence = np.concatenate([np.matmul(covariance, weighted), np.matmul(of_depth, weighted[:, 3:])], axis=1)
-        whole = np.stack([influence_covariance(one, noise.correlation) for one in influence.reshape(n, 5, size, size)])
-        covariance, variance = whole[:, :4], whole[:, 4, 4]
+        of_all = np.concatenate([whole / by[:, :4, None], np.pad(of_depth, ((0, 0), (0, 0), (3, 0)))], axis=1)
+        influence = (np.matmul(of_all[:, :, :4], images) + of_all[:, :, 4:] @ surface.T) * np.sqrt(weight, dtype=np.float64)[:, None]
+        scatter = influence_covariance(influence.reshape(n, 5, size, size), noise.correlation)
+        covariance, variance = scatter[:, :4], scatter[:, 4, 4]
     core = _distance(grid_c - local[:, :1], grid_r - local[:, 1:]) < (radius + sigma_px)[:, None]
     square = weight * residual**2
     core_n = np.maximum((core * valid).sum(1), 1.0)
@@ -238,11 +236,11 @@ def _fit_batch(
     chi2_ring = chi2_uneven = (square * ~core).sum(1) / np.maximum((~core * valid).sum(1) - 10, 1.0)
     if not quick:
         chi2_ring, chi2_uneven = (uneven(residual, weight, local, size, part) for part in (~core, core))
-    raised = weight * (residual + depth * value) ** 2  # over the fitted background, as if there were no ball
+    raised = weight * (residual + theta[:, :1] * images[:, 3]) ** 2  # over the fitted background, as if there were no ball
     return BallFits(
         position_px=local + patches.corner_px,
         radius_px=radius,
-        depth=theta[:, 0].astype(np.float64),
+        depth=theta[:, 0],
         covariance=covariance[:, :, :4],
         chi2_core=chi2_core,
         chi2_ring=chi2_ring,
@@ -318,14 +316,48 @@ def slopes(
     return value, slope * dx, slope * dy, slope_r / kind(sigma_px)
 
 
-def _solve(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
-    # products are added up in double precision: radius and depth of a ball that is small against the blur can all but stand for each other
-    root = np.sqrt(weight, dtype=np.float64)
-    weighted = jac * root[:, None]
-    normal = np.matmul(weighted, weighted.transpose(0, 2, 1))
-    right = np.matmul(weighted, (root * target)[:, :, None])[:, :, 0]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """Least squares in windows: balls of depth one, their derivatives, and the background that the windows have in common."""
+
+    table: BallTable
+    sigma_px: float
+    cols: Float  # (p,), of the kind to calculate with
+    rows: Float
+    surface: Float  # (p, k)
+    squares: Float  # (p, k * k), products of its columns
+
+    def images(self, local: Float, radius: Float) -> Float:
+        """Return derivatives by col (negative), row (negative) and radius, and the images themselves, shape (n, 4, p)."""
+        value, *by = slopes(self.table, self.cols - local[:, :1], self.rows - local[:, 1:], radius, self.sigma_px, self.cols.dtype.type)
+        return np.stack([*by, value], axis=1)
+
+    def normal(self, images: Float, weight: Float, target: Float) -> tuple[Float, Float]:
+        """Return normal matrices (n, 10, 10) and right sides (n, 10)."""
+        # added up in double precision: radius and depth of a ball that is small against the blur can all but stand for each other
+        n, k = len(images), self.surface.shape[1]
+        weight, images = weight.astype(np.float64), images.astype(np.float64)
+        weighted = images * weight[:, None]
+        mixed = (weighted.reshape(4 * n, -1) @ self.surface).reshape(n, 4, k)
+        own = np.matmul(weighted, images.transpose(0, 2, 1))
+        normal = np.block([[own, mixed], [mixed.transpose(0, 2, 1), (weight @ self.squares).reshape(n, k, k)]])
+        return normal, np.concatenate([np.matmul(weighted, target[:, :, None])[:, :, 0], (weight * target) @ self.surface], axis=1)
+
+
+def _model(images: Float, surface: Float, theta: Float) -> Float:
+    kind = images.dtype
+    return np.asarray(theta[:, :1].astype(kind) * images[:, 3] + theta[:, 1:].astype(kind) @ surface.T.astype(kind))
+
+
+def _by_depth(theta: Float) -> Float:
+    """What the derivatives of balls of depth one are to be multiplied by, shape (n, 10)."""
+    depth = np.where(theta[:, :1] == 0, 1e-30, theta[:, :1])
+    return np.concatenate([-depth, -depth, depth, np.ones_like(theta)], axis=1)
+
+
+def _solve(normal: Float, right: Float, damping: float = 1e-9) -> Float:
     scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
-    normal /= scale[:, :, None] * scale[:, None, :]
-    normal[:, np.arange(jac.shape[1]), np.arange(jac.shape[1])] += damping
-    solution: Float = np.linalg.solve(normal, (right / scale)[:, :, None])[:, :, 0] / scale
+    scaled = normal / (scale[:, :, None] * scale[:, None, :])
+    scaled[:, np.arange(scaled.shape[1]), np.arange(scaled.shape[1])] += damping
+    solution: Float = np.linalg.solve(scaled, (right / scale)[:, :, None])[:, :, 0] / scale
     return solution

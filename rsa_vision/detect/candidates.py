@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.junctions import find_junctions
-from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.noise import NoiseModel, medians
 from rsa_vision.detect.strokes import COLUMNS, find_strokes
 from rsa_vision.types import Float
 
@@ -164,6 +164,6 @@ def _local_spread(answer: NDArray[Any], least: float) -> NDArray[Any]:
     block_r, block_c = min(BLOCK, answer.shape[0]), min(BLOCK, answer.shape[1])
     # every third pixel in either direction: the filter's own correlation makes the others nearly copies
     part = np.abs(answer[: n_rows * block_r, : n_cols * block_c].reshape(n_rows, block_r, n_cols, block_c)[:, 1::3, :, 1::3])
-    middle = np.median(part.swapaxes(1, 2).reshape(n_rows, n_cols, -1), axis=2) / 0.6745
+    middle = medians(part.swapaxes(1, 2).reshape(n_rows, n_cols, -1)) / 0.6745
     spread: NDArray[Any] = np.maximum(middle, least).astype(np.float32)
     return spread

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rsa_vision.detect.balls import RADIUS_PX, BallFits
-from rsa_vision.detect.find import MISFIT, misfit
+from rsa_vision.detect.find import EXPLAINED, MISFIT, misfit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float
 
@@ -18,12 +18,44 @@ SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on
 _LEAST_PATTERNS = 3  # sure balls from which their sizes tell something of the others
 _LIKE = 1.25  # images whose spreads are within this factor are of one size
 _SMALLER, _LARGER = 0.7, 1.45  # range of sizes around those of the sure ones: marks of one film are of few sizes
+_FAR = 1.5  # beyond that range, and twice the misfit that a ball may leave: no better fit comes back from there
 
 
 def over_clutter(fits: BallFits) -> Float:
     """Return the significance of each ball over noise and the structure around it, shape (n,)."""
     out: Float = fits.significance / np.sqrt(np.clip(fits.chi2_ring, 1.0, EDGE))
     return out
+
+
+def look_clear(fits: BallFits, noise: NoiseModel) -> Bool:
+    """Say which first fits show what balls of the film are like; hardly anything but balls is among them."""
+    return np.asarray((over_clutter(fits) > SURE) & (misfit(fits, noise) < MISFIT) & (fits.explained > CLOSE))
+
+
+def hopeless(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:
+    """Say which first fits are not worth better ones: fainter than the film's sure balls, not like a ball, and far from their sizes.
+
+    Parameters
+    ----------
+    fits : BallFits
+        With the blur of the film.
+    sigma_px : float
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None where too few balls are sure.
+    """
+    pattern = look_clear(fits, noise)
+    radii = _sizes(fits, pattern, sigma_px)
+    if len(radii) < _LEAST_PATTERNS:
+        return np.zeros(len(pattern), bool)
+    height = _height(fits, sigma_px)
+    faint = (height < UNEXCUSED * np.median(height[pattern])) & (fits.explained < EXPLAINED)
+    high = min(_FAR * _LARGER * radii.max(), RADIUS_PX[1])
+    unlike = (fits.radius_px < _SMALLER / _FAR * radii.min()) | (fits.radius_px >= high) | (misfit(fits, noise) > 2 * MISFIT)
+    return np.asarray(faint & unlike)
 
 
 def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:
@@ -44,18 +76,15 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     ndarray of bool, shape (n,)
     """
     strength = over_clutter(fits)
-    spread = np.hypot(sigma_px, 0.5 * fits.radius_px)
-    spot = spread < SPOT_PX
+    spot = _spread(fits, sigma_px) < SPOT_PX
     # what would be larger still than the fit may go is no ball of that size
     sure = (strength > max(SURE, limit)) & ~spot & (fits.radius_px < RADIUS_PX[1])
     close = misfit(fits, noise) < MISFIT
     pattern = sure & close & (fits.explained > CLOSE)
-    # a size of which there is but one stands for itself only
-    company = (np.abs(np.log(spread[pattern, None] / spread[pattern])) < np.log(_LIKE)).sum(1) > 1
-    radii = fits.radius_px[pattern][company]
+    radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < _LEAST_PATTERNS:
         return np.asarray(sure)
-    height = np.abs(fits.depth) * -np.expm1(-0.5 * (fits.radius_px / sigma_px) ** 2)  # of the blurred image, roughly
+    height = _height(fits, sigma_px)
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
     high_enough = height > np.where(close, FAINT, UNEXCUSED) * typical
@@ -63,3 +92,19 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
     return np.asarray((fits.significance > limit) & alike & (sure | (strength > 0.5 * SURE)))
+
+
+def _spread(fits: BallFits, sigma_px: float) -> Float:
+    return np.asarray(np.hypot(sigma_px, 0.5 * fits.radius_px))
+
+
+def _sizes(fits: BallFits, pattern: Bool, sigma_px: float) -> Float:
+    """Radii of those that may stand as a pattern; a size of which there is but one stands for itself only."""
+    spread = _spread(fits, sigma_px)[pattern]
+    company = (np.abs(np.log(spread[:, None] / spread)) < np.log(_LIKE)).sum(1) > 1
+    return np.asarray(fits.radius_px[pattern][company])
+
+
+def _height(fits: BallFits, sigma_px: float) -> Float:
+    """Of the blurred images, roughly."""
+    return np.asarray(np.abs(fits.depth) * -np.expm1(-0.5 * (fits.radius_px / sigma_px) ** 2))

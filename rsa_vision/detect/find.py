@@ -22,6 +22,7 @@ COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
+PROMISING = 0.75  # of the significance a mark must have: a quick fit may be so far off
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
 
@@ -109,6 +110,25 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     stands_out = fits.significance / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
     explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
     return usable & (misfit(fits, noise, CHANCE) < MISFIT * slack) & explained & (fits.significance > 5.0)
+
+
+def promising(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:
+    """Say which quick fits may become marks: their significance is that in white noise, and the correlation of the noise takes from it.
+
+    Parameters
+    ----------
+    fits : BallFits
+    limit : float
+        Significance that a mark must have, as of :func:`significance_limit`.
+    sigma_px : float
+        Blur they were fitted with.
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    return np.asarray(fits.significance > PROMISING * limit * np.sqrt(noise.gain(np.hypot(sigma_px, 0.5 * fits.radius_px))))
 
 
 def explained_over_noise(fits: BallFits) -> Float:

@@ -168,7 +168,7 @@ def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Floa
         out.right[index] = np.matmul(rest, target)[:, :, 0]
         out.left[index] = np.square(target).sum((1, 2))
         windows = rest.reshape(len(index), 2, patches.size, patches.size)
-        scatter = np.stack([influence_covariance(window, noise.correlation) for window in windows])
+        scatter = influence_covariance(windows, noise.correlation)
         out.spread[index] = 0.5 * np.einsum("nij,nji->n", invert(out.normal[index]), scatter)
     return out
 

@@ -14,7 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible
+from rsa_vision.detect.decide import hopeless, look_clear
+from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
@@ -34,7 +35,13 @@ _LIKE = 0.35  # logarithm of the radius, against the film's median
 
 
 def resolve_balls(
-    film: NDArray[Any], candidates: Candidates, seeds: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None
+    film: NDArray[Any],
+    candidates: Candidates,
+    seeds: BallFits,
+    limit: float,
+    optics: Optics,
+    noise: NoiseModel,
+    tees: Background | None,
 ) -> tuple[BallFits, Bool]:
     """Fit all balls of a film.
 
@@ -45,6 +52,8 @@ def resolve_balls(
         Of the markers' polarity.
     seeds : BallFits
         First looks of that polarity.
+    limit : float
+        Significance that a mark must have.
     optics : Optics
     noise : NoiseModel
     tees : callable, optional
@@ -62,10 +71,17 @@ def resolve_balls(
     others = None if tees is None else lambda _i, cols, rows: (tees(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     good = single.rows(plausible(single, noise, slack=1.5))
-    groups, fits = _groups(good, optics), []
-    for members in _unexplained_pairs(film, candidates, good, optics, tees):
+
+    def groups_worth_fitting() -> list[list[int]]:
+        worth = promising(good, limit, optics.sigma_px, noise) & ~hopeless(good, optics.sigma_px, noise)
+        return [g for g in _groups(good, optics) if worth[g].any()]
+
+    groups, fits = groups_worth_fitting(), []
+    clear = look_clear(good, noise)
+    like = good.rows(clear) if np.count_nonzero(clear) >= _LEAST_KNOWN else good
+    for members in _unexplained_pairs(film, candidates, good, like, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
-        fits.append(pair.rows(_like(pair, good)))
+        fits.append(pair.rows(_like(pair, like)))
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     sure = single.rows(clean)
@@ -75,7 +91,7 @@ def resolve_balls(
     fits += pairs
     if pairs:  # a blob that two balls explain is no ball
         good = good.rows(~_taken(good, join(pairs)))
-        groups = _groups(good, optics)
+        groups = groups_worth_fitting()
     known = good
     for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
         index = np.array(g)
@@ -227,15 +243,18 @@ def _images(known: BallFits, members: Int, optics: Optics, tees: Background | No
     return total, doubtful
 
 
-def _unexplained_pairs(film: NDArray[Any], candidates: Candidates, good: BallFits, optics: Optics, tees: Background | None) -> list[Float]:
+def _unexplained_pairs(
+    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, optics: Optics, tees: Background | None
+) -> list[Float]:
+    """Starts of groups, rows of (col, row, radius), at peaks off all known balls; ``like`` says what a ball is like on this film."""
     if len(good.depth) == 0:
         return []
-    typical = float(np.median(good.radius_px))
+    typical = float(np.median(like.radius_px))
     fine = np.nonzero(candidates.radius_px <= 3.0)[0] if typical < 6 else np.arange(len(candidates.strength))
     peaks = candidates.position_px[fine]
     if len(peaks) == 0:
         return []
-    peaks = peaks[_deep(film, peaks, typical, tees) > 0.4 * np.median(np.abs(good.depth))]
+    peaks = peaks[_deep(film, peaks, typical, tees) > 0.4 * np.median(np.abs(like.depth))]
     if len(peaks) == 0:
         return []
     gaps = np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1))
