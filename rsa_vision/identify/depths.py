@@ -57,7 +57,7 @@ def log_odds_of_depths(depth: Float, log_chance: Float, a: Int, b: Int, pair: Fl
         weight = np.where((a != a[e]) & (b != b[e]), pair, 0.0)
         n = float(weight.sum())
         if n >= LEARNT_FROM:
-            near = log_kernels(depth[e : e + 1], depth[:, None], weight, np.array([LEAST_SPREAD]), n)
+            near = log_kernels(depth[e : e + 1], depth[:, None], weight, np.array([LEAST_SPREAD]), n, 1.0)
             anywhere = np.log(ELSEWHERE / (n + ELSEWHERE)) + log_chance[e]
             result[e] = np.logaddexp(np.log(n / (n + ELSEWHERE)) + near, anywhere) - log_chance[e]
     return result

@@ -24,6 +24,7 @@ UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one 
 NEW_KIND: Final = (0.5, 10.0)  # markers of a size or contrast that no other has, of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
 FAINT: Final = 1e-3  # pairs less probable than that teach nothing
+PRESUMED: Final = 0.5  # pairs that each model describes, beside those at hand (Jeffreys)
 TURNS: Final = 4  # of estimates that depend on each other: slope and spread, models and their parts
 
 
@@ -144,11 +145,12 @@ def _slope(ratios: Float, weight: Float) -> tuple[float, float]:
 
 
 def _parts(models: Float, teachers: Int, weights: Float) -> Float:
-    """Return the share of every model among the teachers of each crossing, one more presumed for each; shape as `models`."""
+    """Return the share of every model among the teachers of each crossing, half a one presumed for each; shape as `models`."""
     parts = np.full(models.shape, 1 / models.shape[1])
     of_teachers = models[teachers]
     for _ in range(TURNS):
         mine = of_teachers + np.log(parts)[:, None]
         mine = np.exp(mine - np.logaddexp.reduce(mine, axis=2)[..., None])
-        parts = (1 + np.einsum("et,etm->em", weights, mine)) / (models.shape[1] + weights.sum(axis=1))[:, None]
+        counts = np.einsum("et,etm->em", weights, mine) + PRESUMED
+        parts = counts / counts.sum(axis=1, keepdims=True)
     return parts

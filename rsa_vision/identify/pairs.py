@@ -114,13 +114,14 @@ def pair_rays(
     known = _looks(bundle, crossings, radius_mm, contrast, quality)
     foci = len(np.unique(bundle.focus))
     groups, share, membership = _groups(bundle, crossings, foci)
+    unsaid = float(np.log(len(bundle) / len(images)))  # of which focus an image is: a pair needs one of each
     claims = [tuple(sorted(set(bundle.image[list(group)].tolist()))) for group in groups]
     look, place, of_quality = np.zeros(len(crossings)), np.zeros(len(crossings)), np.zeros(len(bundle))
     prior, usual_mm = 0.5, float(np.median(crossings.sigma_mm)) if len(crossings) else np.inf
     packing, gain = Packing(np.zeros(0, bool), np.zeros(0)), np.zeros(len(groups))
     for _ in range(ROUNDS):  # what pairs look like, and how many there are, from the pairs themselves
         gain = share @ crossings.log_ratio(usual_mm) + membership @ (look + place)
-        gain += np.array([of_quality[list(g)].sum() + np.log(prior / (1 - prior)) * (len(g) - 1) for g in groups])
+        gain += np.array([of_quality[list(g)].sum() + (np.log(prior / (1 - prior)) - unsaid) * (len(g) - 1) for g in groups])
         packing = pack(claims, gain)
         prior = _fraction(groups, packing, len(images), foci)
         posterior = np.nan_to_num(packing.posterior)
