@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared
-from rsa_vision.detect.templates import find_like
+from rsa_vision.detect.templates import SCALE, find_like
 from rsa_vision.detect.twins import split_twins
 from rsa_vision.types import Float
 
@@ -59,6 +60,8 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     tees = _like(film, models, optics, noise)
     for again in (False, True):
         tees = _distinct(fit_all(film, tees, optics, noise, again=again), models[0])
+    if under := _outshone(film, tees, models[0], optics, noise):
+        tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=True), models[0])
     if not tees:
         return [], [], optics
     around = tees
@@ -163,9 +166,29 @@ def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: No
     return _peeled(film, starts, optics, noise)
 
 
-def _peeled(film: NDArray[Any], starts: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
-    """Keep the starts that still have something to explain once better ones have taken their part."""
-    kept: list[NeedleFit] = []
+def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Find faint tees whose arms reach among those of brighter ones: what the film looks like without these."""
+    starts: list[tuple[float, NeedleFit]] = []
+    for tee in tees:
+        half = int(2.5 * tee.shape.length_px)
+        left, top = (max(int(x) - half, 0) // SCALE * SCALE for x in tee.position_px)
+        cut = film[top : top + 2 * half, left : left + 2 * half].astype(np.float32)
+        rows, cols = np.mgrid[top : top + cut.shape[0], left : left + cut.shape[1]].astype(np.float64)
+        around = others_beside(tee, tees, optics)
+        rest = cut - around(cols, rows).astype(np.float32) if around else cut
+        for col, row, likeness in find_like(rest, model, optics):
+            place = np.array([col + left, row + top])
+            if min(np.hypot(*(t.position_px - place)) for t in tees) > _NEAREST_PX:
+                starts.append((likeness, replace(model, position_px=place)))
+    best = [start for _, start in sorted(starts, key=lambda item: -item[0])]
+    return _peeled(film, best, optics, noise, tees)[len(tees) :]
+
+
+def _peeled(
+    film: NDArray[Any], starts: list[NeedleFit], optics: Optics, noise: NoiseModel, known: Sequence[NeedleFit] = ()
+) -> list[NeedleFit]:
+    """Keep the starts that still have something to explain once better ones, and those known, have taken their part."""
+    kept = list(known)
     in_vain = 0
     for start in starts:  # best likeness first: after a long row of failures only other things are left
         if in_vain == _MOST_IN_VAIN:

@@ -26,10 +26,13 @@ class FilmImages:
     shape: Str
     angle_rad: Float
     radius_mm: Float
+    poor: Bool  # not described by the model of its shape
     log_density: Float  # of clutter around each, per mm2
 
 
-def film_images(xy_mm: Float, covariance_mm2: Float, shape: Str, angle_rad: Float, radius_mm: Float, area_mm2: float) -> FilmImages:
+def film_images(
+    xy_mm: Float, covariance_mm2: Float, shape: Str, angle_rad: Float, radius_mm: Float, poor: Bool, area_mm2: float
+) -> FilmImages:
     """Add the density of images around each: letters and screws make clusters, where a chance hit is likelier."""
     n = len(xy_mm)
     density = np.full(n, n / area_mm2)
@@ -37,7 +40,7 @@ def film_images(xy_mm: Float, covariance_mm2: Float, shape: Str, angle_rad: Floa
     if k >= 3:
         distance = np.asarray(cKDTree(xy_mm).query(xy_mm, k=k + 1)[0])[:, k]
         density = np.maximum(density, k / (np.pi * np.maximum(distance, 0.5) ** 2))
-    return FilmImages(xy_mm, covariance_mm2, shape, angle_rad, radius_mm, np.log(density))
+    return FilmImages(xy_mm, covariance_mm2, shape, angle_rad, radius_mm, poor, np.log(density))
 
 
 def appearance(scene: Scene, parameters: Float, images: FilmImages) -> Float:
@@ -74,7 +77,8 @@ def angle_difference_deg(scene: Scene, parameters: Float, images: FilmImages) ->
 def on_bodies(scene: Scene, parameters: Float, images: FilmImages, rows: Int) -> Bool:
     """Tell which images may be parts of the image of a mark rather than markers: shape (len(rows), n).
 
-    A detector may see balls and pins on the pins of a tee. A ball clearly wider than the pins is no part of them, unless where they meet.
+    A detector may see balls and pins on the pins of a tee. A ball clearly wider than the pins is no part of them, unless where they meet, or
+    where it is a poor ball: arms of tees from two foci that cross are as wide.
     """
     place = project(scene, parameters, rows)
     focus = parameters[FILM:].reshape(-1, 3)[scene.focus[rows], 2]
@@ -82,7 +86,7 @@ def on_bodies(scene: Scene, parameters: Float, images: FilmImages, rows: Int) ->
     offset = images.xy_mm[None] - place[:, None]
     away = np.hypot(offset[..., 0], offset[..., 1])
     with np.errstate(invalid="ignore"):
-        wide = (images.shape == "ball") & (images.radius_mm > 1.35 * width[:, None])
+        wide = (images.shape == "ball") & (images.radius_mm > 1.35 * width[:, None]) & ~images.poor
     result = np.zeros(away.shape, bool)
     result |= away < 1.2 * width[:, None] + np.where(wide, 0.0, BODY_MM)
     for arm in range(scene.arms_mm.shape[1]):

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from rsa_vision.cages import Cage
+from rsa_vision.flags import MarkerFlag
 from rsa_vision.identify.appearance import FilmImages, film_images, on_bodies
 from rsa_vision.identify.checks import are_different, far_penalty, impossible_stretch, what_contradicts, what_is_missing
 from rsa_vision.identify.doubts import doubtful_marks, drop_gross_errors, without
@@ -171,7 +172,8 @@ class _Film:
         covariance += (0.002 * scale) ** 2 * np.eye(2)  # a covariance of zero would outweigh all else
         angle = np.deg2rad(images.angle_deg)
         angle = np.arctan2(np.sin(angle), (-1 if reading.mirrored else 1) * np.cos(angle))
-        return film_images(images.position_px @ to_mm, covariance, images.shape, angle, images.radius_px * scale, self.area_mm2)
+        poor: Bool = (images.flags & MarkerFlag.POOR_FIT) != 0
+        return film_images(images.position_px @ to_mm, covariance, images.shape, angle, images.radius_px * scale, poor, self.area_mm2)
 
 
 def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Limits) -> CageIdentification:

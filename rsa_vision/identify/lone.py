@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from scipy.special import expit, gammaln
 
-from rsa_vision.identify.pair_looks import KIND, UNSURE, WIDE, log_kernels, log_student
+from rsa_vision.identify.densities import log_kernels, log_student
+from rsa_vision.identify.looks import KIND, UNSURE, WIDE
 from rsa_vision.types import Bool, Float
 
 PRESUMED: Final = (0.5, 0.05)  # markers that one focus does not show: that many, and that part of those both show

@@ -1,87 +1,31 @@
 """What two images of one marker look like, against images without a partner; both are learnt from the films at hand.
 
 The images of a marker have the size and contrast of the other markers, and agree with each other, better still, in the size that their
-depth implies and in contrast. Images without a partner look like anything: clutter, or now and then a marker that the other focus does not
-show. Logarithms of size and contrast are used throughout, so that a shift is a factor.
+depth implies and in contrast. What lies before them, and the exposure, change their contrasts; with its contrast the fitted size of an
+image changes by little, but alike on all films of an examination.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.special import expit, gammaln
 
+from rsa_vision.identify.alone import Alone
+from rsa_vision.identify.densities import log_kernels, log_student, weighted_median
+from rsa_vision.identify.looks import KIND, LEARNT_FROM, WIDE, Looks
 from rsa_vision.types import Bool, Float, Int
 
-LEARNT_FROM: Final = 3.0  # pairs (sum of their probabilities) that teach what pairs look like
 USUAL: Final = np.array([0.05, 0.10])  # sd of the ratio of sizes, and of contrasts: a guess that weighs like USUAL_COUNT pairs
 USUAL_COUNT: Final = 1.0
 LEAST: Final = np.array([0.01, 0.03])
-KIND: Final = np.array([0.03, 0.05])  # sd of sizes and contrasts within a kind of ball
-WIDE: Final = np.array([0.7, 0.7])  # sd of sizes and contrasts of any images
-HIDDEN: Final = (0.5, 10.0)  # markers that one focus does not show, of all: a guess of one in twenty, which weighs like ten markers
-UNKNOWN: Final = 2.0  # images that look like anything, which are presumed beside those at hand
+SLOPE: Final = 0.25  # of log size against log contrast, sd: half of it would leave the light that a ball takes away unchanged
 UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one image, a film's toe), of all: as HIDDEN
 NEW_KIND: Final = (0.5, 10.0)  # markers of a size or contrast that no other has, of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
-UNSURE: Final = np.array([0.2, 0.4])  # error of the logs of size and contrast of an image that is not clear
 FAINT: Final = 1e-3  # pairs less probable than that teach nothing
-CLASSES: Final = 3  # of images: clear, disturbed (by a neighbour, an edge, saturation), and not described by the model
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Looks:
-    """What is known of the looks of rays and of their crossings.
-
-    Attributes
-    ----------
-    image : ndarray of int, shape (n,)
-        Image of every ray.
-    of_ray : ndarray of shape (n, 2)
-        Log of apparent radius and of contrast; NaN where unknown.
-    quality : ndarray of int, shape (n,)
-        Class of the image of every ray, below :data:`CLASSES`.
-    a, b : ndarray of int, shape (m,)
-        The rays of every crossing.
-    grown_a, grown_b : ndarray of shape (m,)
-        Log of the factor by which a marker at the crossing is smaller than its images.
-    """
-
-    image: Int
-    of_ray: Float
-    quality: Int
-    a: Int
-    b: Int
-    grown_a: Float
-    grown_b: Float
-
-    @property
-    def unsure(self) -> Float:
-        """Error of the look of every ray, shape (n, 2)."""
-        result: Float = np.where((self.quality > 0)[:, None], UNSURE[: self.of_ray.shape[1]], 0.0)
-        return result
-
-    @property
-    def sizes(self) -> Looks:
-        """The same without contrast."""
-        return replace(self, of_ray=self.of_ray[:, :1])
-
-    def as_usual_here(self, pair: Float) -> Looks:
-        """Take disturbed images for clear ones where too few pairs are clear to teach: on saturated films all look like that.
-
-        Parameters
-        ----------
-        pair : ndarray of shape (m,)
-            Probability of every crossing to be a marker, so far.
-
-        Returns
-        -------
-        Looks
-        """
-        clear = (self.quality[self.a] == 0) & (self.quality[self.b] == 0)
-        return self if pair[clear].sum() >= LEARNT_FROM else replace(self, quality=np.maximum(self.quality - 1, 0))
+PRESUMED: Final = 0.5  # pairs that each model describes, beside those at hand (Jeffreys)
+TURNS: Final = 4  # of estimates that depend on each other: slope and spread, models and their parts
 
 
 def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone, alone_by_size: Alone) -> Float:
@@ -106,8 +50,8 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone, alone_by_size: Al
     Two images of different markers need no place in this ratio: the assignments that give each its own partner speak against theirs. A pair
     that does not look like one may still do so in size: bone before one image, or another exposure, changes its contrast only.
     """
-    like, unlike = _log_like(looks, pair, alone)
-    like_in_size, unlike_in_size = _log_like(looks.sizes, pair, alone_by_size)
+    like, unlike = _log_like(looks, pair, alone, contrast=True)
+    like_in_size, unlike_in_size = _log_like(looks, pair, alone_by_size, contrast=False)
     share = (UNLIKE[0] / 2 + unlike_in_size) / (UNLIKE[0] + np.maximum(unlike, unlike_in_size))  # of the pairs unlike in either
     taught = float(pair.sum())
     part = (UNLIKE[0] + unlike) / (UNLIKE[1] + taught)
@@ -116,9 +60,14 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone, alone_by_size: Al
     return result
 
 
-def _log_like(looks: Looks, pair: Float, alone: Alone) -> tuple[Float, Float]:
-    """Return the log likelihood ratio of pairs that look like one, and how many of the teachers of each do not; zeros if none taught."""
-    d = looks.of_ray.shape[1]
+def _log_like(looks: Looks, pair: Float, alone: Alone, *, contrast: bool) -> tuple[Float, Float]:
+    """Return the log likelihood ratio of pairs that look like one, and how many of the teachers of each do not; zeros if none taught.
+
+    Three models say what a marker's two images look like: like those of all markers, and like each other; like the two of one of the other
+    pairs, since contrasts come in sorts where two exposures lap on a film; or of one size, each with the contrast of any image of a marker
+    from its focus, since bone lies before one and not before the other. How often each holds, the other pairs tell.
+    """
+    d = 2 if contrast else 1
     first, second = looks.of_ray[looks.a].copy(), looks.of_ray[looks.b].copy()
     first[:, 0] += looks.grown_a
     second[:, 0] += looks.grown_b
@@ -129,156 +78,79 @@ def _log_like(looks: Looks, pair: Float, alone: Alone) -> tuple[Float, Float]:
     weight_a = np.where(known_a, np.where(unsure_a[:, 0] > 0, 1e-3, 1.0), 0.0)[:, None]
     weight_b = np.where(known_b, np.where(unsure_b[:, 0] > 0, 1e-3, 1.0), 0.0)[:, None]
     both = np.maximum(weight_a + weight_b, 1e-9)
-    mean = (weight_a * np.nan_to_num(first) + weight_b * np.nan_to_num(second)) / both
     unsure = np.hypot(weight_a * unsure_a, weight_b * unsure_b) / both
-    of_pair = np.column_stack([mean, first - second])
+    of_ratio = np.hypot(unsure_a, unsure_b)
     teachers = np.flatnonzero(known_a & known_b & ~unsure_a.any(axis=1) & ~unsure_b.any(axis=1) & (pair > FAINT))
-    result, unlike = np.zeros(len(pair)), np.zeros(len(pair))
-    for e in np.flatnonzero(known_a | known_b):
-        free = teachers[(looks.a[teachers] != looks.a[e]) & (looks.b[teachers] != looks.b[e])]
+    models, unlike = np.zeros((len(pair), 3 if contrast else 2)), np.zeros(len(pair))
+    weights = pair[teachers] * ((looks.a[teachers] != looks.a[:, None]) & (looks.b[teachers] != looks.b[:, None]))
+    told = (known_a | known_b) & (weights.sum(axis=1) >= LEARNT_FROM)
+    for e in np.flatnonzero(told):
+        free = teachers[weights[e] > 0]
         weight = pair[free]
         n = float(weight.sum())
-        if n < LEARNT_FROM:
-            continue
-        ratios = first[free] - second[free]
-        middle = _weighted_median(ratios, weight)
+        slope, slope_sd = _slope(first[free] - second[free], weight)
+        shear = np.array([[1.0, 0.0], [-slope, 1.0]])[:, :d]  # sizes as they would be at one contrast
+        one, other = first @ shear, second @ shear
+        mean = (weight_a * np.nan_to_num(one) + weight_b * np.nan_to_num(other)) / both
+        ratios = one[free] - other[free]
+        middle = weighted_median(ratios, weight)
         deviation = np.abs(ratios - middle)
-        spread = np.maximum(1.4826 * _weighted_median(deviation, weight), LEAST[:d])
+        spread = np.maximum(1.4826 * weighted_median(deviation, weight), LEAST[:d])
         spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL[:d] ** 2) / (n + USUAL_COUNT))
         unlike[e] = weight[(deviation > FAR * spread).any(axis=1)].sum()
-        new, wide = NEW_KIND[0] / (NEW_KIND[1] + n), np.hypot(WIDE[:d], unsure[e])
-        of_new = float((log_student((mean[e] - _weighted_median(mean[free], weight)) / wide, 3.0) - np.log(wide)).sum())
-        of_known = log_kernels(mean[e], mean[free], weight, np.hypot(np.hypot(KIND[:d], unsure[e]), spread / 2), n)
-        marker = float(np.logaddexp(np.log1p(-new) + of_known, np.log(new) + of_new))
-        if known_a[e] and known_b[e]:
-            wider = np.hypot(spread * np.sqrt(1 + 1 / n), np.hypot(unsure_a[e], unsure_b[e]))
-            marker += float((log_student((first[e] - second[e] - middle) / wider, min(n, 4.0)) - np.log(wider)).sum())
-            # where two exposures lap on a film, contrasts come in sorts: as likely, a pair looks like one of the other pairs
-            width = np.hypot([*KIND[:d], *np.minimum(spread, USUAL[:d])], [*unsure[e], *np.hypot(unsure_a[e], unsure_b[e])])
-            marker = np.logaddexp(marker, log_kernels(of_pair[e], of_pair[free], weight, width, n)) - np.log(2)
-        result[e] = marker - known_a[e] * alone.log_density[looks.a[e]] - known_b[e] * alone.log_density[looks.b[e]]
-    return result, unlike
+        width = np.hypot(np.hypot(KIND[:d], unsure[e, :d]), spread / 2)
+        wide = np.hypot(WIDE[:d], unsure[e, :d])
+        marker = _of_kinds(mean[e], mean[free], weight, width, wide)
+        if not (known_a[e] and known_b[e]):
+            models[e] = marker
+            continue
+        apart = float(first[e, 1] - second[e, 1] - weighted_median(first[free, 1:] - second[free, 1:], weight)[0])
+        error = np.hypot(of_ratio[e, :d], [slope_sd * apart, 0.0][:d])
+        wider = np.hypot(spread * np.sqrt(1 + 1 / n), error)
+        agree = log_student((one[e] - other[e] - middle) / wider, min(n, 4.0)) - np.log(wider)
+        models[e, 0] = marker + float(agree.sum())
+        of_pair = np.column_stack([mean, one - other])
+        width = np.hypot([*KIND[:d], *np.minimum(spread, USUAL[:d])], [*unsure[e, :d], *error])
+        models[e, 1] = log_kernels(of_pair[e], of_pair[free], weight, width, n)
+        if contrast:
+            models[e, 2] = _of_kinds(mean[e, :1], mean[free, :1], weight, width[:1], wide[:1]) + agree[0]
+            for mine, sure in ((one, unsure_a), (other, unsure_b)):
+                models[e, 2] += log_kernels(mine[e, 1:], mine[free, 1:], weight, np.hypot(KIND[1:], sure[e, 1:]), n)
+    result = np.logaddexp.reduce(models + np.log(_parts(models, teachers, weights)), axis=1)
+    result -= known_a * alone.log_density[looks.a] + known_b * alone.log_density[looks.b]
+    return np.where(told, result, 0.0), unlike
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Alone:
-    """Images without a partner.
-
-    Attributes
-    ----------
-    log_density : ndarray of shape (n,)
-        Of their looks, at that of every ray.
-    log_quality : ndarray of shape (n,)
-        Log likelihood ratio of the class of every ray's image: with a partner, against without.
-    hidden : float
-        The part of all markers that one focus does not show.
-    """
-
-    log_density: Float
-    log_quality: Float
-    hidden: float
+def _of_kinds(value: Float, sample: Float, weight: Float, width: Float, wide: Float) -> float:
+    """Return the log density of what a marker looks like: like one of the others, or the only one of its kind."""
+    n = float(weight.sum())
+    new = NEW_KIND[0] / (NEW_KIND[1] + n)
+    of_new = float((log_student((value - weighted_median(sample, weight)) / wide, 3.0) - np.log(wide)).sum())
+    return float(np.logaddexp(np.log1p(-new) + log_kernels(value, sample, weight, width, n), np.log(new) + of_new))
 
 
-def images_alone(looks: Looks, paired: Float) -> Alone:
-    """Describe the images without a partner, by what is at hand and by presumed ones: hidden markers, and images that look like anything.
-
-    Parameters
-    ----------
-    looks : Looks
-    paired : ndarray of shape (n,)
-        Probability of the image of every ray to have a partner.
-
-    Returns
-    -------
-    Alone
-    """
-    _, one = np.unique(looks.image, return_index=True)  # on a shared film an image has several rays
-    single, pairs = 1 - paired[one], float(paired[one].sum()) / 2
-    quality, value, unsure = looks.quality[one], looks.of_ray[one], looks.unsure[one]
-    wide, kind = WIDE[: value.shape[1]], KIND[: value.shape[1]]
-    known: Bool = np.array(np.isfinite(value).all(axis=1))
-    clear = known & (quality == 0)
-    density = np.zeros(len(looks.of_ray))
-    if not clear.any() or pairs < 0.5:
-        return Alone(density, density.copy(), _hidden(float(single.sum()), pairs))
-    middle = _weighted_median(value[clear], np.ones(int(clear.sum())))
-    of_pairs = np.where(clear, np.maximum(paired[one], 1e-9), 0.0)
-    broad = (log_student((value - middle) / np.hypot(wide, unsure), 3.0) - np.log(np.hypot(wide, unsure))).sum(axis=1)
-    shares = _shares(quality, paired[one])
-    odds = np.log(CLASSES * shares)[quality]
-    odds[known] += [
-        log_kernels(value[k], value[clear], of_pairs[clear], np.hypot(kind, unsure[k]), 2 * pairs) for k in np.flatnonzero(known)
-    ]
-    odds[known] -= broad[known]
-    hidden = _hidden(float(single @ expit(odds)), pairs)
-    presumed = hidden * 2 * pairs
-    of_image = np.zeros(len(one))
-    for k in np.flatnonzero(known):  # among those fitted as well as this one, or as badly
-        alike = known & ((quality == 0) == (quality[k] == 0))
-        others, unknown = np.arange(len(one)) != k, UNKNOWN * (1 if quality[k] == 0 else CLASSES - 1) / CLASSES
-        markers = presumed * float(shares[0] if quality[k] == 0 else 1 - shares[0])
-        weights, widths = (np.where(alike & others, single, 0.0), np.where(clear & others, of_pairs, 0.0)), np.hypot(kind, unsure[k])
-        parts = [np.log(unknown) + broad[k]]
-        if weights[0].sum() > 0:
-            n = float(weights[0].sum())
-            parts.append(np.log(n) + log_kernels(value[k], value[alike], weights[0][alike], np.hypot(widths, unsure[k]), n))
-        if weights[1].sum() > 0:
-            parts.append(np.log(markers) + log_kernels(value[k], value[clear], weights[1][clear], widths, 2 * pairs))
-        of_image[k] = np.logaddexp.reduce(parts) - np.log(weights[0].sum() + markers + unknown)
-    density = of_image[np.searchsorted(looks.image[one], looks.image)]
-    return Alone(density, _log_quality(looks, one, paired, presumed), hidden)
+def _slope(ratios: Float, weight: Float) -> tuple[float, float]:
+    """Return how log sizes change with log contrasts, and its error, by the two images of each marker: a ball has one size."""
+    slope, slope_sd = 0.0, SLOPE
+    for _ in range(TURNS):
+        rest = ratios[:, :1] - slope * ratios[:, 1:]
+        deviation = rest - weighted_median(rest, weight)
+        spread = max(1.4826 * float(weighted_median(np.abs(deviation), weight)[0]), LEAST[0])
+        spread = np.sqrt((weight.sum() * spread**2 + USUAL_COUNT * USUAL[0] ** 2) / (weight.sum() + USUAL_COUNT))
+        trust = weight * 5 / (4 + (deviation[:, 0] / spread) ** 2)  # Student's, of four degrees of freedom
+        size, contrast = (ratios - trust @ ratios / trust.sum()).T
+        normal = trust @ contrast**2 + (spread / SLOPE) ** 2
+        slope, slope_sd = float(trust @ (contrast * size) / normal), float(spread / np.sqrt(normal))
+    return slope, slope_sd
 
 
-def _log_quality(looks: Looks, one: Int, paired: Float, presumed: float) -> Float:
-    """Return how much likelier the class of every ray's image is with a partner than without, by the other images.
-
-    Among those without are presumed ones, as for the looks: hidden markers, and some of any class.
-    """
-    result = np.zeros(len(looks.quality))
-    for ray, mine in enumerate(looks.quality):
-        others = one[looks.image[one] != looks.image[ray]]
-        with_partner, single = _shares(looks.quality[others], paired[others]), 1 - paired[others]
-        without = np.bincount(looks.quality[others], single, CLASSES) + presumed * with_partner + UNKNOWN / CLASSES
-        result[ray] = np.log(with_partner[mine] / (without[mine] / without.sum()))
-    return result
-
-
-def _shares(quality: Int, weight: Float) -> Float:
-    """Return the share of every class among images that count by a weight, and one more that is presumed in equal parts."""
-    count = np.bincount(quality, weight, CLASSES) + 1 / CLASSES
-    result: Float = count / count.sum()
-    return result
-
-
-def _hidden(alone: float, pairs: float) -> float:
-    return min((alone + HIDDEN[0]) / (pairs + alone + HIDDEN[1]), 0.5)
-
-
-def log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: float) -> float:
-    """Return the log of a kernel density estimate; kernels of half of Scott's width, since there may be several kinds of balls."""
-    middle = weight @ sample / weight.sum()
-    spread = np.sqrt(weight @ (sample - middle) ** 2 / weight.sum())
-    return _log_density(value, sample, weight, np.hypot(least, 0.5 * max(n, 1.0) ** (-1 / 6) * spread), n)
-
-
-def _log_density(value: Float, sample: Float, weight: Float, width: Float, n: float) -> float:
-    kernels = (log_student((value - sample) / width, n) - np.log(width)).sum(axis=1)
-    with np.errstate(divide="ignore"):
-        return float(np.logaddexp.reduce(kernels + np.log(weight / weight.sum())))
-
-
-def _weighted_median(values: Float, weight: Float) -> Float:
-    """Return the median of every column."""
-    order = np.argsort(values, axis=0)
-    total = np.cumsum(weight[order], axis=0)
-    place = (total < total[-1] / 2).sum(axis=0)
-    result: Float = np.take_along_axis(values, np.take_along_axis(order, place[None], axis=0), axis=0)[0]
-    return result
-
-
-def log_student(t: Float, freedom: float) -> Float:
-    """Return the log density of Student's t distribution, of two degrees of freedom at least."""
-    v = max(float(freedom), 2.0)
-    scale = gammaln((v + 1) / 2) - gammaln(v / 2) - 0.5 * np.log(v * np.pi)
-    result: Float = scale - (v + 1) / 2 * np.log1p(np.square(t) / v)
-    return result
+def _parts(models: Float, teachers: Int, weights: Float) -> Float:
+    """Return the share of every model among the teachers of each crossing, half a one presumed for each; shape as `models`."""
+    parts = np.full(models.shape, 1 / models.shape[1])
+    of_teachers = models[teachers]
+    for _ in range(TURNS):
+        mine = of_teachers + np.log(parts)[:, None]
+        mine = np.exp(mine - np.logaddexp.reduce(mine, axis=2)[..., None])
+        counts = np.einsum("et,etm->em", weights, mine) + PRESUMED
+        parts = counts / counts.sum(axis=1, keepdims=True)
+    return parts

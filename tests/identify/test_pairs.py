@@ -14,8 +14,10 @@ from hypothesis import strategies as st
 from scipy.stats import poisson
 
 from rsa_vision.geometry.rays import RayBundle
+from rsa_vision.identify.alone import images_alone
+from rsa_vision.identify.looks import Looks
 from rsa_vision.identify.packing import pack
-from rsa_vision.identify.pair_looks import Looks, images_alone, log_odds_of_looks
+from rsa_vision.identify.pair_looks import log_odds_of_looks
 from rsa_vision.identify.pairs import Pairing, pair_rays
 
 EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "60"))
