@@ -77,8 +77,8 @@ def angle_difference_deg(scene: Scene, parameters: Float, images: FilmImages) ->
 def on_bodies(scene: Scene, parameters: Float, images: FilmImages, rows: Int) -> Bool:
     """Tell which images may be parts of the image of a mark rather than markers: shape (len(rows), n).
 
-    A detector may see balls and pins on the pins of a tee. A ball clearly wider than the pins is no part of them, unless where they meet, or
-    where it is a poor ball: arms of tees from two foci that cross are as wide.
+    A detector may see balls and pins on the pins of a tee. A ball clearly wider than the pins is no part of them, unless where they
+    meet, or where it is a poor ball: arms of tees from two foci that cross are as wide.
     """
     place = project(scene, parameters, rows)
     focus = parameters[FILM:].reshape(-1, 3)[scene.focus[rows], 2]

@@ -11,7 +11,6 @@ import numpy as np
 
 from rsa_vision.cages import Cage
 from rsa_vision.geometry.rays import RayBundle, cross
-from rsa_vision.identify.depths import log_chance_of_depths
 from rsa_vision.types import Bool, Float, Int
 
 WINDOWS_MM: Final = (3.0, 10.0)  # in which unrelated crossings are counted
@@ -92,8 +91,6 @@ class Crossings:
         Crossing distance and its standard deviation.
     grown_a, grown_b : ndarray of shape (n,)
         Log of the distances from the focus, crossing over film.
-    log_chance : ndarray of shape (n,)
-        Log density of such a depth where unrelated rays cross, as of :func:`log_chance_of_depths`.
     log_density : ndarray of shape (n,)
         Log density of unrelated crossings, per mm of signed distance.
     """
@@ -104,17 +101,10 @@ class Crossings:
     sigma_mm: Float
     grown_a: Float
     grown_b: Float
-    log_chance: Float
     log_density: Float
 
     def __len__(self) -> int:
         return len(self.a)
-
-    @property
-    def log_depth(self) -> Float:
-        """Log of how far from the foci they are, as a part of the way to the film, both rays together."""
-        result: Float = (self.grown_a + self.grown_b) / 2
-        return result
 
     def rows(self, index: Int | Bool) -> Crossings:
         """Return some of them."""
@@ -149,8 +139,9 @@ class Crossings:
         Parameters
         ----------
         usual_mm : float
-            Error of the crossings that are clear. Errors far larger are stated for images that nothing describes well: so far off the centre
-            may be, and most lie as near as any other. Every size between is as likely as the next, in steps of :data:`BOUND`.
+            Error of the crossings that are clear. Errors far larger are stated for images that nothing describes well: so far
+            off the centre may be, and most lie as near as any other. Every size between is as likely as the next, by steps
+            of :data:`BOUND`.
 
         Returns
         -------
@@ -194,7 +185,7 @@ def find_crossings(bundle: RayBundle, region: Region | None) -> tuple[Crossings,
     inside = region or in_front(bundle.rows(known))
     length = np.linalg.norm(bundle.through_mm - bundle.origin_mm, axis=1)
     none = np.zeros(0)
-    parts = [Crossings(none.astype(int), none.astype(int), *[none] * 6)]
+    parts = [Crossings(none.astype(int), none.astype(int), *[none] * 5)]
     neighbours = []
     for p, q in combinations(np.unique(bundle.focus[known]), 2):
         first, second = np.flatnonzero(known & (bundle.focus == p)), np.flatnonzero(known & (bundle.focus == q))
@@ -206,13 +197,11 @@ def find_crossings(bundle: RayBundle, region: Region | None) -> tuple[Crossings,
         with np.errstate(invalid="ignore"):
             median = float(np.median(distance[np.isfinite(distance)])) if np.isfinite(distance).any() else 0.0
         neighbours.append(Neighbours(first, second, close, max(SPREAD_OF_MEDIAN * median, 2 * WINDOWS_MM[-1])))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            grown_a = np.log(np.linalg.norm(points - bundle.origin_mm[first][:, None], axis=2) / length[first][:, None])
-            grown_b = np.log(np.linalg.norm(points - bundle.origin_mm[second], axis=2) / length[second])
-        at = np.nonzero(close[0])
-        grown = grown_a[at], grown_b[at]
-        chance = log_chance_of_depths((grown[0] + grown[1]) / 2, ((grown_a + grown_b) / 2)[possible], possible.size)
-        parts.append(Crossings(first[at[0]], second[at[1]], distance[at], sigma[at], *grown, chance, np.zeros(len(at[0]))))
+        i, j = np.nonzero(close[0])
+        a, b, at = first[i], second[j], points[i, j]
+        grown_a = np.log(np.linalg.norm(at - bundle.origin_mm[a], axis=1) / length[a])
+        grown_b = np.log(np.linalg.norm(at - bundle.origin_mm[b], axis=1) / length[b])
+        parts.append(Crossings(a, b, distance[i, j], sigma[i, j], grown_a, grown_b, np.zeros(len(a))))
     crossings = Crossings(*(np.concatenate([getattr(part, name) for part in parts]) for name in Crossings.__slots__))
     return crossings.among(tuple(neighbours), np.ones(len(bundle))), tuple(neighbours)
 

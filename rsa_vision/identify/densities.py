@@ -8,11 +8,11 @@ from scipy.special import gammaln
 from rsa_vision.types import Float
 
 
-def log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: float, narrow: float = 0.5) -> float:
+def log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: float) -> float:
     """Return the log of a kernel density estimate; kernels of half of Scott's width, since there may be several kinds of balls."""
     middle = weight @ sample / weight.sum()
     spread = np.sqrt(weight @ (sample - middle) ** 2 / weight.sum())
-    width = np.hypot(least, narrow * max(n, 1.0) ** (-1 / 6) * spread)
+    width = np.hypot(least, 0.5 * max(n, 1.0) ** (-1 / 6) * spread)
     kernels = (log_student((value - sample) / width, n) - np.log(width)).sum(axis=1)
     with np.errstate(divide="ignore"):
         return float(np.logaddexp.reduce(kernels + np.log(weight / weight.sum())))

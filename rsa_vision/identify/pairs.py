@@ -17,7 +17,6 @@ from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.alone import images_alone
 from rsa_vision.identify.crossings import Crossings, Region, common_error, find_crossings
 from rsa_vision.identify.densities import weighted_median
-from rsa_vision.identify.depths import log_odds_of_depths
 from rsa_vision.identify.looks import Looks
 from rsa_vision.identify.packing import Packing, components, pack
 from rsa_vision.identify.pair_looks import log_odds_of_looks
@@ -114,14 +113,13 @@ def pair_rays(
     known = _looks(bundle, crossings, radius_mm, contrast, quality)
     foci = len(np.unique(bundle.focus))
     groups, share, membership = _groups(bundle, crossings, foci)
-    unsaid = float(np.log(len(bundle) / len(images)))  # of which focus an image is: a pair needs one of each
     claims = [tuple(sorted(set(bundle.image[list(group)].tolist()))) for group in groups]
-    look, place, of_quality = np.zeros(len(crossings)), np.zeros(len(crossings)), np.zeros(len(bundle))
+    look, of_quality = np.zeros(len(crossings)), np.zeros(len(bundle))
     prior, usual_mm = 0.5, float(np.median(crossings.sigma_mm)) if len(crossings) else np.inf
     packing, gain = Packing(np.zeros(0, bool), np.zeros(0)), np.zeros(len(groups))
     for _ in range(ROUNDS):  # what pairs look like, and how many there are, from the pairs themselves
-        gain = share @ crossings.log_ratio(usual_mm) + membership @ (look + place)
-        gain += np.array([of_quality[list(g)].sum() + (np.log(prior / (1 - prior)) - unsaid) * (len(g) - 1) for g in groups])
+        gain = share @ crossings.log_ratio(usual_mm) + membership @ look
+        gain += np.array([of_quality[list(g)].sum() + np.log(prior / (1 - prior)) * (len(g) - 1) for g in groups])
         packing = pack(claims, gain)
         prior = _fraction(groups, packing, len(images), foci)
         posterior = np.nan_to_num(packing.posterior)
@@ -134,7 +132,6 @@ def pair_rays(
             usual_mm = float(weighted_median(crossings.sigma_mm[:, None], of_crossing)[0])
         looks = known.as_usual_here(of_crossing)
         alone = images_alone(looks, of_ray)
-        place = log_odds_of_depths(crossings.log_depth, crossings.log_chance, crossings.a, crossings.b, of_crossing)
         crossings = crossings.among(neighbours, (1 - of_ray) + alone.hidden * of_ray)
         look, of_quality = log_odds_of_looks(looks, of_crossing, alone, images_alone(looks.sizes, of_ray)), alone.log_quality
     found = _pairing(bundle, crossings, groups, membership, packing, images, limits, slack)
