@@ -16,6 +16,7 @@ from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
 from rsa_vision.detect.find import CHANCE, MISFIT, ROUNDNESS, STRENGTH, distinct, first_look, fit_at, misfit, plausible, significance_limit
+from rsa_vision.detect.leftover import noise_under
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needle_images import NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
@@ -33,7 +34,7 @@ __all__ = ["Detection", "detect_markers"]
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _ENOUGH_BALLS = 8  # that tell the noise under them
-_LEAST_UNDER, _MOST_UNDER, _NEARLY_WHITE = 0.4, 2.5, 1.1  # what they may tell; sum of the noise's correlations
+_MOST_UNDER = 0.4, 2.5  # what they may tell
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
@@ -191,7 +192,7 @@ def _one_polarity(
             balls = join([balls.rows(apart), ball])
             touching = np.append(touching[apart], True)
             tees = [*tees, tee]
-    images = _table(film, bits, balls, touching, tees + pins, noise)
+    images = _table(film, bits, balls, touching, tees + pins, optics, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
     return evidence, Detection(images, sign < 0, optics, noise)
@@ -224,13 +225,15 @@ def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
     return out
 
 
-def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees: list[NeedleFit], noise: NoiseModel) -> MarkerImages:
+def _table(
+    film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees: list[NeedleFit], optics: Optics, noise: NoiseModel
+) -> MarkerImages:
     """Put balls and tees into one table, film order (row by row), with flags."""
     full = float(2**bits - 1)
     n, m = len(balls.depth), len(tees)
     position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
     # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
-    usual = _noise_under(balls, touching, noise)
+    usual = _variance_under(balls, touching, optics, noise)
     excess = np.where(balls.chi2_uneven > usual * (1 + CHANCE * noise.scatter(balls.n_core)), balls.chi2_uneven, usual)
     # structure around a ball that the quadratic background does not hold goes on under it
     excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0))
@@ -263,18 +266,11 @@ def _table(film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees:
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1]))))
 
 
-def _noise_under(balls: BallFits, touching: Bool, noise: NoiseModel) -> float:
-    """Variance under a film's balls in units of that beside them, from what all of them leave together.
-
-    The film's values under marks occur nowhere else, so that no tile tells their noise: quanta are fewer there, the slope of the film curve
-    is another, and bone goes on. Of the residuals only the odd part counts, which the model's own errors do not have.
-    """
+def _variance_under(balls: BallFits, touching: Bool, optics: Optics, noise: NoiseModel) -> float:
     clear = ~touching & (balls.valid_fraction > 0.999) & (balls.chi2_ring < STRUCTURE)
     if np.count_nonzero(clear) < _ENOUGH_BALLS:
         return 1.0
-    # of noise that neighbours share a fit takes a part with it, more than parameters: less is left than there was
-    least = _LEAST_UNDER if noise.correlation.sum() < _NEARLY_WHITE else 1.0
-    return float(np.clip(np.median(balls.chi2_uneven[clear]), least, _MOST_UNDER))
+    return float(np.clip(noise_under(balls.chi2_uneven[clear], balls.radius_px[clear], optics, noise), *_MOST_UNDER))
 
 
 def _excess(fit: NeedleFit, noise: NoiseModel) -> float:

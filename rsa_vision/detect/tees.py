@@ -26,6 +26,7 @@ from rsa_vision.types import Float
 _BEFORE = 1.5  # tolerance before attenuation and ends are fitted
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
+_SAME_JUNCTION = 0.5  # of the length of its arms, from a junction to the tip fitted to it
 _MOST_JUNCTIONS = 80
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _FAINTEST = 0.05  # of the depth of the film's clearest tee: a film linear in exposure has little of it behind thick tissue
@@ -124,6 +125,8 @@ def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseMo
             rough, best_taper = tried, taper
         if not rough or _mean_misfit(rough) < CLEAN:
             break
+        tips = np.array([f.position_px for f in rough])  # what is nearly a tee of one taper is where there are tees of another
+        order = order[(np.hypot(*(order[:, None, :2] - tips).transpose(2, 0, 1)) < _SAME_JUNCTION * order[:, 3:4]).any(axis=1)]
     if not rough or not is_tee(rough[0], slack=1.5):
         return []  # crossings of other things: not one is nearly a tee
     rough = [f for f in rough if f.shape.taper == best_taper]

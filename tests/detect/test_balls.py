@@ -48,6 +48,22 @@ def test_every_ball_is_found_and_its_stated_error_is_true(cnr: float, noise_blur
     assert BAND[0] < ratio < BAND[1]
 
 
+@pytest.mark.parametrize("power", [-1.0, 1.0])  # of the exposure: variance on a film of its logarithm, and on a linear one
+@pytest.mark.parametrize("noise_blur_px", [0.0, 0.8])
+def test_noise_under_balls_is_not_that_beside_them(power: float, noise_blur_px: float) -> None:
+    rng = np.random.default_rng(4)
+    truth, radius = grid_of_balls(rng, 10, 90.0, (4.0, 5.0))
+    clear = film_of_balls((940, 940), truth, radius, background=BACKGROUND, depth=0.6, sigma_px=1.2)
+    noise = film_of_balls((940, 940), truth[:0], radius[:0], background=0.0, noise_sd=900.0, noise_blur_px=noise_blur_px, rng=rng)
+    found = detect_markers(stored(clear + noise * (clear / BACKGROUND) ** (power / 2)), bits=16).images
+    index, gap = nearest(truth, Detection(found, True, None, None))  # type: ignore[arg-type]  # of the detection only the images count
+    assert (gap < 1.0).all()
+    error = found.position_px[index] - truth
+    ratio = float(np.sqrt((error**2 / np.einsum("nii->ni", found.covariance_px2[index])).mean()))
+    print(f"variance with power {power} of the exposure, noise blur {noise_blur_px}: error / sd {ratio:.2f}")
+    assert BAND[0] < ratio < BAND[1]
+
+
 @pytest.mark.parametrize(("cnr", "part"), [(50, 0.04), (20, 0.05), (10, 0.06), (5, 0.12)])
 @pytest.mark.parametrize("sigma_px", [0.8, 1.4])
 def test_blur_and_attenuation_are_those_of_the_film(cnr: float, part: float, sigma_px: float) -> None:
