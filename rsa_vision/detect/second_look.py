@@ -22,6 +22,7 @@ from rsa_vision.types import Bool, Float
 
 _LEAST = 3  # balls that tell what one of them is like
 _CLEAR = 0.9  # of the limit, over clutter
+_FAR, _SLACK = 1.5, 1.4  # times the limit, times the misfit that is tolerated otherwise
 _SCALE, _SIZE = 2.0, 1.6  # ratios of the filter's radius and of the fitted one to the usual one
 
 
@@ -64,9 +65,15 @@ def look_again(
             return none
         fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick)
         stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
-        fits = distinct(fits.rows(stays & plausible(fits, noise) & (over_clutter(fits) > _CLEAR * limit)), noise)
+        fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise) & (over_clutter(fits) > _CLEAR * limit)), noise)
         place = fits.position_px
     return fits
+
+
+def _like_a_ball(fits: BallFits, limit: float, noise: NoiseModel) -> Bool:
+    """Say which are plausible; what stands out far may leave more: dust, an edge or bone lies over balls as well."""
+    far = over_clutter(fits) > _FAR * limit
+    return np.asarray(plausible(fits, noise) | (far & plausible(fits, noise, _SLACK)))
 
 
 def _near(position_px: Float, balls: BallFits, radius_px: float) -> Bool:
