@@ -19,7 +19,7 @@ from rsa_vision.types import Bool, Float, Int
 USUAL: Final = np.array([0.05, 0.10])  # sd of the ratio of sizes, and of contrasts: a guess that weighs like USUAL_COUNT pairs
 USUAL_COUNT: Final = 1.0
 LEAST: Final = np.array([0.01, 0.03])
-SLOPE: Final = 0.25  # of log size against log contrast, sd: half of it would leave the light that a ball takes away unchanged
+SLOPE: Final = 0.1  # of log size against log contrast, sd; 0.5 would leave the light that a ball takes away unchanged
 UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one image, a film's toe), of all: as HIDDEN
 NEW_KIND: Final = (0.5, 10.0)  # markers of a size or contrast that no other has, of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
@@ -99,7 +99,7 @@ def _log_like(looks: Looks, pair: Float, alone: Alone, *, contrast: bool) -> tup
         spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL[:d] ** 2) / (n + USUAL_COUNT))
         unlike[e] = weight[(deviation > FAR * spread).any(axis=1)].sum()
         width = np.hypot(np.hypot(KIND[:d], unsure[e, :d]), spread / 2)
-        wide = np.hypot(WIDE[:d], unsure[e, :d])
+        of_size, wide = width[:1], np.hypot(WIDE[:d], unsure[e, :d])
         marker = _of_kinds(mean[e], mean[free], weight, width, wide)
         if not (known_a[e] and known_b[e]):
             models[e] = marker
@@ -113,9 +113,11 @@ def _log_like(looks: Looks, pair: Float, alone: Alone, *, contrast: bool) -> tup
         width = np.hypot([*KIND[:d], *np.minimum(spread, USUAL[:d])], [*unsure[e, :d], *error])
         models[e, 1] = log_kernels(of_pair[e], of_pair[free], weight, width, n)
         if contrast:
-            models[e, 2] = _of_kinds(mean[e, :1], mean[free, :1], weight, width[:1], wide[:1]) + agree[0]
+            models[e, 2] = _of_kinds(mean[e, :1], mean[free, :1], weight, of_size, wide[:1]) + agree[0]
+            # of balls as large as this one: thicker balls take more light away
+            alike = weight * np.exp(log_student((mean[e, 0] - mean[free, 0]) / of_size[0], n))
             for mine, sure in ((one, unsure_a), (other, unsure_b)):
-                models[e, 2] += log_kernels(mine[e, 1:], mine[free, 1:], weight, np.hypot(KIND[1:], sure[e, 1:]), n)
+                models[e, 2] += log_kernels(mine[e, 1:], mine[free, 1:], alike, np.hypot(KIND[1:], sure[e, 1:]), n)
     result = np.logaddexp.reduce(models + np.log(_parts(models, teachers, weights)), axis=1)
     result -= known_a * alone.log_density[looks.a] + known_b * alone.log_density[looks.b]
     return np.where(told, result, 0.0), unlike
