@@ -87,7 +87,10 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     height = _height(fits, sigma_px)
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
-    high_enough = height > np.where(close, FAINT, UNEXCUSED) * typical
+    least = np.where(close, FAINT, UNEXCUSED)
+    # where few quanta come through a linear film shows small depths, and little noise: either may be compared
+    over_noise = height / np.sqrt(noise.variance_at(fits.background))
+    high_enough = (height > least * typical) | (over_noise > least * np.median(over_noise[pattern]))
     sure &= high_enough
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
