@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
-from rsa_vision.detect.candidates import Candidates
+from rsa_vision.detect.candidates import SCALES, Candidates
 from rsa_vision.detect.decide import over_clutter
-from rsa_vision.detect.find import distinct, fit_at, plausible
+from rsa_vision.detect.find import distinct, fit_at, plausible, promising
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import Background, beside_balls, inside
@@ -23,7 +23,8 @@ from rsa_vision.types import Bool, Float
 _LEAST = 3  # balls that tell what one of them is like
 _CLEAR = 0.9  # of the limit, over clutter
 _FAR, _SLACK = 1.5, 1.4  # times the limit, times the misfit that is tolerated otherwise
-_SCALE, _SIZE = 2.0, 1.6  # ratios of the filter's radius and of the fitted one to the usual one
+_ROUND = 0.4  # the filter that suits the usual size answers balls of it by round extrema
+_SIZE = 1.6  # ratio of the fitted radius to the usual one
 
 
 def look_again(
@@ -54,7 +55,8 @@ def look_again(
     if len(balls.depth) < _LEAST:
         return none
     usual = float(np.median(balls.radius_px))
-    fitting = np.abs(np.log(candidates.radius_px / usual)) < np.log(_SCALE)
+    scale = SCALES[int(np.argmin([abs(np.log(radius / usual)) for *_, radius in SCALES]))][-1]
+    fitting = (candidates.radius_px == scale) & (candidates.roundness > _ROUND)
     place = candidates.position_px[fitting & ~_near(candidates.position_px, balls, usual)]
 
     def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
@@ -65,7 +67,8 @@ def look_again(
             return none
         fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick)
         stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
-        fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise) & (over_clutter(fits) > _CLEAR * limit)), noise)
+        enough = promising(fits, limit, optics.sigma_px, noise) if quick else over_clutter(fits) > _CLEAR * limit
+        fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise) & enough), noise)
         place = fits.position_px
     return fits
 

@@ -38,7 +38,7 @@ def test_wrist_beads(frame: str, view: int) -> None:
     found, more = score(film, truth)
     print(f"wrist {frame} view {view}: {found} of {len(truth)}, {more} more")
     assert found >= 16
-    assert more <= 3
+    assert more <= 2
 
 
 def test_pig_beads() -> None:
@@ -52,5 +52,5 @@ def test_pig_beads() -> None:
             total, hits = total + len(truth), hits + found
             extras.append(more)
     print(f"pig: {hits} of {total}, more per frame {extras}")
-    assert hits >= 0.9 * total  # the aim is 97 %: beads over dense bone in the first frames are still missed
+    assert hits >= 0.97 * total
     assert max(extras) <= 3
