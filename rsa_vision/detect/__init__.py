@@ -25,6 +25,7 @@ from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, o
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
 from rsa_vision.detect.second_look import look_again
+from rsa_vision.detect.surroundings import variance_of_surroundings
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
@@ -237,6 +238,8 @@ def _table(
     excess = np.where(balls.chi2_uneven > usual * (1 + CHANCE * noise.scatter(balls.n_core)), balls.chi2_uneven, usual)
     # structure around a ball that the quadratic background does not hold goes on under it
     excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0))
+    reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in tees])
+    excess *= variance_of_surroundings(film, balls, position[n:], reach, optics, noise)
     covariance = np.concatenate(
         [
             balls.covariance[:, :2, :2] * excess[:, None, None],
@@ -254,7 +257,8 @@ def _table(
     flags[(valid < 0.999) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < 0.8] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
-    poor = np.concatenate([misfit(balls, noise, CHANCE), [t.misfit for t in tees]]) > 0.6 * MISFIT
+    under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
+    poor = np.concatenate([misfit(under, noise, CHANCE), [t.misfit for t in tees]]) > 0.6 * MISFIT
     poor[:n] |= balls.chi2_ring > EDGE
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it

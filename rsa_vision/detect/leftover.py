@@ -11,6 +11,7 @@ from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.types import Float
 
 _FITTED = 4  # parameters that ``uneven`` counts off
+_AT_RIM = 0.7  # the rim, which tells the centre, lies at half the depth; the mean of all that is under a ball at seven tenths
 _OUTLIER = 3.0  # times the median
 
 
@@ -52,7 +53,7 @@ def expected_uneven(radius_px: float, optics: Optics, noise: NoiseModel) -> floa
 
 
 def noise_under(uneven: Float, radius_px: Float, optics: Optics, noise: NoiseModel) -> float:
-    """Return the variance under a film's balls in units of that beside them, from what all of them leave together.
+    """Return the variance at the rims of a film's balls in units of that beside them, from what all of them leave together.
 
     The values under marks occur nowhere else on a film, so that no tile tells their noise: quanta are fewer there, the slope of the film
     curve is another, and bone goes on. Of the residuals only the odd part counts, which the model's own errors do not have.
@@ -69,4 +70,4 @@ def noise_under(uneven: Float, radius_px: Float, optics: Optics, noise: NoiseMod
     float
     """
     usual = uneven[uneven < _OUTLIER * np.median(uneven)]
-    return float(usual.mean()) / expected_uneven(float(np.median(radius_px)), optics, noise)
+    return float(usual.mean() / expected_uneven(float(np.median(radius_px)), optics, noise)) ** _AT_RIM

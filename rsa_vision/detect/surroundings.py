@@ -1,0 +1,89 @@
+"""What the film around a ball would do to its centre: the fit's own estimator, held over places beside it where no mark is.
+
+Noise that is what the model says gives there the errors that are stated. Bone gives more: what a quadratic surface does not follow goes on
+under the ball, where no residual shows it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls import BallFits, half_size, polynomial, slopes
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.patches import cut
+from rsa_vision.detect.profiles import Optics, ball_table
+from rsa_vision.types import Float
+
+_DIRECTIONS = 2 * np.pi * np.arange(8) / 8
+_FARTHER = (1.0, 1.5)  # distances, in units of the nearest one that is free of the ball
+_PRESUMED = 12.0  # places that the film's usual ratio counts for
+_LEAST = 4  # free places from which a ball's surroundings tell something
+_QUIETEST = 0.6  # less than that is chance
+_MEDIAN = 1.386  # of chi2 with two degrees of freedom
+
+
+def variance_of_surroundings(
+    film: NDArray[Any], balls: BallFits, others_px: Float, reach_px: Float, optics: Optics, noise: NoiseModel
+) -> Float:
+    """Return the squared errors that the surroundings of balls would make of their centres, over what noise would.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    balls : BallFits
+    others_px : ndarray of shape (m, 2)
+        (col, row) of pins and tees.
+    reach_px : ndarray of shape (m,)
+        How far their images go.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of shape (n,)
+        Medians over the places around each ball, drawn towards the median over the film; 1 where there are none.
+    """
+    n = len(balls.depth)
+    marks = np.concatenate([balls.position_px, others_px])
+    reach = np.concatenate([balls.radius_px + 3 * optics.sigma_px, reach_px])
+    halves = np.array([half_size(r, optics.sigma_px) for r in balls.radius_px])
+    angle = np.tile(_DIRECTIONS, len(_FARTHER)) + np.repeat(np.arange(len(_FARTHER)), len(_DIRECTIONS)) * np.pi / 8
+    ratio = np.full((n, len(angle)), np.nan)
+    for half in np.unique(halves):
+        index = np.nonzero(halves == half)[0]
+        nearest = half + balls.radius_px[index] + 3 * optics.sigma_px
+        distance = nearest[:, None] * np.repeat(_FARTHER, len(_DIRECTIONS))
+        place = balls.position_px[index, None] + distance[:, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        gap = np.abs(place[:, :, None] - marks).max(axis=3)
+        free = (gap > half + reach).all(axis=2)
+        ball, where = np.nonzero(free)
+        patches = cut(film, place[ball, where], int(half), noise)
+        whole = patches.valid.all(axis=(1, 2))
+        ball, where, values = ball[whole], where[whole], patches.values[whole].reshape(np.count_nonzero(whole), -1)
+        by_film, covariance = _estimator(balls.rows(index), int(half), optics, noise)
+        error = np.einsum("kip,kp->ki", by_film[ball], values - values.mean(axis=1, keepdims=True))
+        square = np.einsum("ki,ki->k", error, np.linalg.solve(covariance[ball], error[:, :, None])[:, :, 0])
+        ratio[index[ball], where] = square / noise.variance_at(values.mean(axis=1)) / _MEDIAN
+    counted = np.isfinite(ratio).sum(axis=1)
+    if not (counted >= _LEAST).any():
+        return np.ones(n)
+    usual = float(np.nanmedian(ratio))
+    own = np.array([np.nanmedian(r) if k >= _LEAST else usual for r, k in zip(ratio, counted, strict=True)])
+    weight = np.where(counted >= _LEAST, counted, 0) / (counted + _PRESUMED)
+    return np.asarray(np.exp(weight * np.log(np.maximum(own, _QUIETEST)) + (1 - weight) * np.log(max(usual, _QUIETEST))))
+
+
+def _estimator(balls: BallFits, half: int, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
+    """Least-squares estimators (n, 2, pixels) of centres from windows, and their covariances for noise of variance one."""
+    size = 2 * half + 1
+    rows, cols = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, 1, -1).astype(np.float64)
+    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
+    n = len(balls.depth)
+    value, by_dx, by_dy, by_radius = slopes(table, np.repeat(cols, n, 0), np.repeat(rows, n, 0), balls.radius_px, optics.sigma_px)
+    surface = np.broadcast_to(polynomial(half, cols[0], rows[0]).T, (n, 6, size * size))
+    jac = np.concatenate([np.stack([-by_dx, -by_dy, by_radius, value], axis=1), surface], axis=1)
+    estimator = np.matmul(np.linalg.pinv(np.matmul(jac, jac.transpose(0, 2, 1)), hermitian=True)[:, :2], jac) / balls.depth[:, None, None]
+    return estimator, influence_covariance(estimator.reshape(n, 2, size, size), noise.correlation)
