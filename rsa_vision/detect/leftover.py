@@ -70,4 +70,4 @@ def noise_under(uneven: Float, radius_px: Float, optics: Optics, noise: NoiseMod
     float
     """
     usual = uneven[uneven < _OUTLIER * np.median(uneven)]
-    return float(usual.mean() / expected_uneven(float(np.median(radius_px)), optics, noise)) ** _AT_RIM
+    return float((usual.mean() / expected_uneven(float(np.median(radius_px)), optics, noise)) ** _AT_RIM)
