@@ -62,7 +62,7 @@ def variance_of_surroundings(
         ball, where = np.nonzero(free)
         patches = cut(film, place[ball, where], int(half), noise)
         whole = patches.valid.all(axis=(1, 2))
-        ball, where, values = ball[whole], where[whole], patches.values[whole].reshape(np.count_nonzero(whole), -1)
+        ball, where, values = ball[whole], where[whole], patches.values[whole].reshape(-1, (2 * int(half) + 1) ** 2)
         by_film, covariance = _estimator(balls.rows(index), int(half), optics, noise)
         error = np.einsum("kip,kp->ki", by_film[ball], values - values.mean(axis=1, keepdims=True))
         square = np.einsum("ki,ki->k", error, np.linalg.solve(covariance[ball], error[:, :, None])[:, :, 0])
