@@ -158,9 +158,9 @@ def test_balls_over_the_edge_of_the_film_are_flagged() -> None:
         assert found.images.flags[index[0]] & MarkerFlag.EDGE
 
 
-def test_balls_without_free_film_around_them_are_measured() -> None:
+def test_a_ball_on_a_film_too_small_for_surroundings_is_measured() -> None:
     rng = np.random.default_rng(8)
-    truth, radius = grid_of_balls(rng, 6, 27.0, (3.0, 4.0))
-    film = film_of_balls((185, 185), truth, radius, background=BACKGROUND, depth=DEPTH, noise_sd=300.0, rng=rng)
+    truth = np.array([[25.3, 24.8]])
+    film = film_of_balls((50, 50), truth, np.array([3.5]), background=BACKGROUND, depth=DEPTH, noise_sd=300.0, rng=rng)
     _, gap = nearest(truth, detect_markers(stored(film), bits=16))
     assert (gap < 0.5).all()
