@@ -10,6 +10,7 @@ from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float
 
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
+ALONE = 10.0  # the same for marks of which there are not enough to tell what they are like
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
 UNEXCUSED = 0.5  # those below that have to fit closely
@@ -83,7 +84,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     pattern = sure & close & (fits.explained > CLOSE)
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < _LEAST_PATTERNS:
-        return np.asarray(sure)
+        # nothing tells what marks are like here: those that have no company have to be clearer, and noise is no excuse for what they leave
+        return np.asarray(sure & close & (strength > ALONE))
     height = _height(fits, sigma_px)
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves

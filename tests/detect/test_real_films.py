@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rsa_vision.detect import detect_markers
+from rsa_vision.images import read_film
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "real"
 NEAR_PX = 2.0
@@ -54,3 +55,18 @@ def test_pig_beads() -> None:
     print(f"pig: {hits} of {total}, more per frame {extras}")
     assert hits >= 0.97 * total
     assert max(extras) <= 3
+
+
+@pytest.mark.parametrize("name", ["RG1_UNCR", "RG3_UNCR"])
+def test_films_without_markers(name: str) -> None:
+    film = read_film(REAL / f"negatives/{name}.dcm")
+    assert len(detect_markers(film.values, bits=film.bits).images) <= 2
+
+
+@pytest.mark.parametrize("name", ["couch0", "gantry0", "gantry90"])
+def test_the_single_ball_of_a_winston_lutz_film(name: str) -> None:
+    film = read_film(REAL / f"winston_lutz/{name}.dcm")
+    middle = (np.array(film.values.shape)[::-1] - 1) / 2
+    found = detect_markers(film.values, bits=film.bits).images.position_px
+    assert np.count_nonzero(np.hypot(*(found - middle).T) < 20) == 1
+    assert len(found) <= 2
