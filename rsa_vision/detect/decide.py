@@ -17,6 +17,7 @@ UNEXCUSED = 0.5  # those below that have to fit closely
 EDGE = 16.0  # more variance than this around a ball, in units of the noise, is an edge beside it; edges do not look like balls
 SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
 _LEAST_PATTERNS = 3  # sure balls from which their sizes tell something of the others
+_COMPANY = 6  # sure ones of one size that stand for each other where none is clear enough for a pattern
 _LIKE = 1.25  # images whose spreads are within this factor are of one size
 _SMALLER, _LARGER = 0.7, 1.45  # range of sizes around those of the sure ones: marks of one film are of few sizes
 _FAR = 1.5  # beyond that range, and twice the misfit that a ball may leave: no better fit comes back from there
@@ -84,8 +85,10 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     pattern = sure & close & (fits.explained > CLOSE)
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < _LEAST_PATTERNS:
-        # nothing tells what marks are like here: those that have no company have to be clearer, and noise is no excuse for what they leave
-        return np.asarray(sure & close & (strength > ALONE))
+        # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
+        spread = np.log(_spread(fits, sigma_px))
+        company = (np.abs(spread[:, None] - spread[sure]) < np.log(_LIKE)).sum(axis=1) >= _COMPANY
+        return np.asarray(sure & (company | (close & (strength > ALONE))))
     height = _height(fits, sigma_px)
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
