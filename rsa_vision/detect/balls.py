@@ -316,6 +316,28 @@ def slopes(
     return value, slope * dx, slope * dy, slope_r / kind(sigma_px)
 
 
+def derivatives(radius: Float, half: int, sigma_px: float, mu_px: float) -> Float:
+    """Return what windows of ``2 half + 1`` pixels around balls of depth one say of them.
+
+    Parameters
+    ----------
+    radius : ndarray of shape (n,)
+    half : int
+    sigma_px, mu_px : float
+
+    Returns
+    -------
+    ndarray of shape (n, 10, pixels)
+        By dx, dy (minus those by the centre) and radius, the images themselves, and the background's six coefficients.
+    """
+    rows, cols = (
+        np.repeat(axis.reshape(1, -1), len(radius), 0) for axis in np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
+    )
+    value, *by = slopes(ball_table(round(mu_px * sigma_px, 3)), cols, rows, radius, sigma_px)
+    surface = polynomial(half, cols[0], rows[0]).T
+    return np.concatenate([np.stack([*by, value], axis=1), np.broadcast_to(surface, (len(radius), *surface.shape))], axis=1)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Equations:
     """Least squares in windows: balls of depth one, their derivatives, and the background that the windows have in common."""

@@ -86,8 +86,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < _LEAST_PATTERNS:
         # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
-        spread = np.log(_spread(fits, sigma_px))
-        company = (np.abs(spread[:, None] - spread[sure]) < np.log(_LIKE)).sum(axis=1) >= _COMPANY
+        company = _of_like_spread(_spread(fits, sigma_px), sure) >= _COMPANY
         return np.asarray(sure & (company | (close & (strength > ALONE))))
     height = _height(fits, sigma_px)
     typical = float(np.median(height[pattern]))
@@ -108,9 +107,13 @@ def _spread(fits: BallFits, sigma_px: float) -> Float:
 
 def _sizes(fits: BallFits, pattern: Bool, sigma_px: float) -> Float:
     """Radii of those that may stand as a pattern; a size of which there is but one stands for itself only."""
-    spread = _spread(fits, sigma_px)[pattern]
-    company = (np.abs(np.log(spread[:, None] / spread)) < np.log(_LIKE)).sum(1) > 1
-    return np.asarray(fits.radius_px[pattern][company])
+    company = _of_like_spread(_spread(fits, sigma_px), pattern) > 1
+    return np.asarray(fits.radius_px[pattern & company])
+
+
+def _of_like_spread(spread: Float, among: Bool) -> Float:
+    """Count those of a choice whose images are of one size with each, shape (n,)."""
+    return np.asarray((np.abs(np.log(spread[:, None] / spread[among])) < np.log(_LIKE)).sum(axis=1))
 
 
 def _height(fits: BallFits, sigma_px: float) -> Float:

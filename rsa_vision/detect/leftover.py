@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import fftconvolve
 
-from rsa_vision.detect.balls import half_size, polynomial, slopes
+from rsa_vision.detect.balls import derivatives, half_size
 from rsa_vision.detect.noise import LAGS, NoiseModel
-from rsa_vision.detect.profiles import Optics, ball_table
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 _FITTED = 4  # parameters that ``uneven`` counts off
@@ -35,9 +35,7 @@ def expected_uneven(radius_px: float, optics: Optics, noise: NoiseModel) -> floa
     half = half_size(radius_px, optics.sigma_px)
     size = 2 * half + 1
     rows, cols = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
-    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
-    ball = slopes(table, cols[None].astype(float), rows[None].astype(float), np.array([radius_px]), optics.sigma_px)
-    jac = np.column_stack([*(b[0] for b in ball), polynomial(half, cols, rows)])
+    jac = derivatives(np.array([radius_px]), half, optics.sigma_px, optics.mu_px)[0].T
     images = jac.T.reshape(-1, size, size)
     shared = fftconvolve(images, noise.correlation[None], mode="same", axes=(1, 2)).reshape(len(images), -1).T
     core = np.hypot(cols, rows) < radius_px + optics.sigma_px

@@ -41,7 +41,7 @@ def ball_evidence(fits: BallFits, noise: NoiseModel) -> float:
 
 
 def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> tuple[Optics, float]:
-    """Estimate blur and attenuation that the best candidates of a film have in common, by maximum likelihood on a grid.
+    """Estimate blur and attenuation that the best candidates of a film have in common: a grid tells which are balls, all of them the rest.
 
     Parameters
     ----------

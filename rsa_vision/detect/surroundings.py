@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits, half_size, polynomial, slopes
+from rsa_vision.detect.balls import BallFits, derivatives, half_size
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
-from rsa_vision.detect.profiles import Optics, ball_table
+from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 _DIRECTIONS = 2 * np.pi * np.arange(8) / 8
@@ -78,12 +78,8 @@ def variance_of_surroundings(
 
 def _estimator(balls: BallFits, half: int, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
     """Least-squares estimators (n, 2, pixels) of centres from windows, and their covariances for noise of variance one."""
-    size = 2 * half + 1
-    rows, cols = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, 1, -1).astype(np.float64)
-    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
-    n = len(balls.depth)
-    value, by_dx, by_dy, by_radius = slopes(table, np.repeat(cols, n, 0), np.repeat(rows, n, 0), balls.radius_px, optics.sigma_px)
-    surface = np.broadcast_to(polynomial(half, cols[0], rows[0]).T, (n, 6, size * size))
-    jac = np.concatenate([np.stack([-by_dx, -by_dy, by_radius, value], axis=1), surface], axis=1)
-    estimator = np.matmul(np.linalg.pinv(np.matmul(jac, jac.transpose(0, 2, 1)), hermitian=True)[:, :2], jac) / balls.depth[:, None, None]
-    return estimator, influence_covariance(estimator.reshape(n, 2, size, size), noise.correlation)
+    jac = derivatives(balls.radius_px, half, optics.sigma_px, optics.mu_px)
+    inverse = np.linalg.pinv(np.matmul(jac, jac.transpose(0, 2, 1)), hermitian=True)
+    estimator = -np.matmul(inverse[:, :2], jac) / balls.depth[:, None, None]
+    windows = estimator.reshape(len(balls.depth), 2, 2 * half + 1, 2 * half + 1)
+    return estimator, influence_covariance(windows, noise.correlation)
