@@ -23,16 +23,15 @@ from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import resolve_balls
+from rsa_vision.detect.resolve import images_beside, resolve_balls
 from rsa_vision.detect.second_look import look_again
-from rsa_vision.detect.surroundings import variance_of_surroundings
+from rsa_vision.detect.settle import STRUCTURE, settle
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
 __all__ = ["Detection", "detect_markers"]
 
-STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _ENOUGH_BALLS = 8  # that tell the noise under them
 _MOST_UNDER = 0.4, 2.5  # what they may tell
@@ -178,22 +177,32 @@ def _one_polarity(
                 total += needle_image(dx, dy, t, seen).reshape(cols.shape)
         return total
 
-    balls, touching = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
+    balls, touching, edged = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
-    balls, touching = balls.rows(keep), touching[keep]
+    balls, touching, edged = balls.rows(keep), touching[keep], edged[keep]
     more = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needle_images if needles else None)
     both = join([balls, more])
     like = are_balls(both, limit, optics.sigma_px, noise)[len(balls.depth) :]
     more = more.rows(like & (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins))
-    balls, touching = join([balls, more]), np.append(touching, np.zeros(len(more.depth), bool))
+    balls, (touching, edged) = join([balls, more]), (np.append(known, np.zeros(len(more.depth), bool)) for known in (touching, edged))
     for fit in doubtful:
         if found := part(film, fit, balls, optics, tee_optics, noise, needle_images, is_tee):
             tee, ball = found
             apart = np.hypot(*(balls.position_px - ball.position_px[0]).T) > ball.radius_px[0]
             balls = join([balls.rows(apart), ball])
-            touching = np.append(touching[apart], True)
+            touching, edged = np.append(touching[apart], True), np.append(edged[apart], False)
             tees = [*tees, tee]
-    images = _table(film, bits, balls, touching, tees + pins, optics, noise)
+
+    def beside(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+        return images_beside(known, np.array([i]), optics, needle_images if needles else None, cols, rows)
+
+    known = balls
+    others = tees + pins
+    place = np.array([t.position_px for t in others]).reshape(-1, 2)
+    reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
+    under = _variance_under(balls, touching, optics, noise)
+    balls, ratio = settle(film, balls, under, ~touching, edged, place, reach, beside, optics, noise)
+    images = _table(film, bits, balls, under, ratio, touching, others, optics, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
     return evidence, Detection(images, sign < 0, optics, noise)
@@ -227,19 +236,28 @@ def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
 
 
 def _table(
-    film: NDArray[Any], bits: int, balls: BallFits, touching: Bool, tees: list[NeedleFit], optics: Optics, noise: NoiseModel
+    film: NDArray[Any],
+    bits: int,
+    balls: BallFits,
+    usual: float,
+    ratio: Float,
+    touching: Bool,
+    tees: list[NeedleFit],
+    optics: Optics,
+    noise: NoiseModel,
 ) -> MarkerImages:
-    """Put balls and tees into one table, film order (row by row), with flags."""
+    """Put balls and tees into one table, film order (row by row), with flags.
+
+    ``usual`` is the noise under balls, ``ratio`` what :func:`rsa_vision.detect.settle.settle` says of their surroundings.
+    """
     full = float(2**bits - 1)
     n, m = len(balls.depth), len(tees)
     position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
     # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
-    usual = _variance_under(balls, touching, optics, noise)
-    excess = np.where(balls.chi2_uneven > usual * (1 + CHANCE * noise.scatter(balls.n_core)), balls.chi2_uneven, usual)
-    # structure around a ball that the quadratic background does not hold goes on under it
-    excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0))
-    reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in tees])
-    excess *= variance_of_surroundings(film, balls, position[n:], reach, optics, noise)
+    left = balls.chi2_uneven / usual
+    excess = np.where(left > 1 + CHANCE * noise.scatter(balls.n_core), left, 1.0)
+    # structure around a ball that its background does not hold goes on under it
+    excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0)) * ratio
     covariance = np.concatenate(
         [
             balls.covariance[:, :2, :2] * excess[:, None, None],

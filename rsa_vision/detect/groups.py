@@ -104,7 +104,7 @@ def fit_group(
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
         window_fraction=np.full(k, valid.mean()),
         log_likelihood=np.full(k, -0.5 * square.sum()),
-        background=np.full(k, theta[k]),
+        background=(surface @ theta[k : k + surface.shape[1]])[distance.argmin(1)],
         significance=np.abs(theta[:k]) / np.sqrt(np.maximum(np.diag(whole)[4 * k :], 1e-30)),
         n_core=inside,
         converged=np.full(k, converged),

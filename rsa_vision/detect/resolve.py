@@ -42,7 +42,7 @@ def resolve_balls(
     optics: Optics,
     noise: NoiseModel,
     tees: Background | None,
-) -> tuple[BallFits, Bool]:
+) -> tuple[BallFits, Bool, Bool]:
     """Fit all balls of a film.
 
     Parameters
@@ -65,9 +65,11 @@ def resolve_balls(
         Those that are balls.
     touching : ndarray of bool, shape (n,)
         Fitted together with a neighbour.
+    edged : ndarray of bool, shape (n,)
+        Fitted together with an edge.
     """
     if len(seeds.depth) == 0:
-        return seeds, np.zeros(0, bool)
+        return seeds, np.zeros(0, bool), np.zeros(0, bool)
     others = None if tees is None else lambda _i, cols, rows: (tees(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     good = single.rows(plausible(single, noise, slack=1.5))
@@ -104,31 +106,32 @@ def resolve_balls(
     if len(alone):
 
         def neighbours(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
-            return _images(known, alone[[i]], optics, tees, cols, rows)
+            return images_beside(known, alone[[i]], optics, tees, cols, rows)
 
         fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
     if not fits:
-        return single.rows(np.zeros(len(single.depth), bool)), np.zeros(0, bool)
+        return single.rows(slice(0)), np.zeros(0, bool), np.zeros(0, bool)
     found = join(fits)
     found = found.rows(plausible(found, noise) & inside(found, film))
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
-    found = _beside_edges(film, distinct(found, noise), optics, noise, tees)
+    found, edged = _beside_edges(film, distinct(found, noise), optics, noise, tees)
     near = [len(g) > 1 for g in _groups(found, optics)]
     touching = np.zeros(len(found.depth), bool)
     for g, several in zip(_groups(found, optics), near, strict=True):
         touching[g] = several
-    return found, touching
+    return found, touching, edged
 
 
-def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
-    """Fit again, with an edge in the background, the balls that lie on or beside one (the likelihood tells).
+def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> tuple[BallFits, Bool]:
+    """Fit again, with an edge in the background, the balls that lie on or beside one (the likelihood tells); say which they are.
 
     An edge that a quadratic surface cannot follow pulls the centre. What the edge model moves it by says how much is at stake: half of that
     is added to the stated error, since edges bend and have other profiles than the model's.
     """
-    parts = []
+    parts, edged_too = [fits.rows(slice(0))], []
     for g in _groups(fits, optics):
         index = np.array(g)
+        edged_too.append(np.zeros(len(g), bool))
         beside = _beside(fits, index, optics, tees)
         plain = fits.rows(index)
         # a size at the limit is not fitted: nothing that comes to rest there is a ball
@@ -150,7 +153,8 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
         covariance = edged.covariance.copy()
         covariance[:, :2, :2] += 0.25 * shift[:, :, None] * shift[:, None, :]
         parts.append(replace(edged, covariance=covariance))
-    return join(parts) if parts else fits
+        edged_too[-1][:] = True
+    return join(parts), np.concatenate([np.zeros(0, bool), *edged_too])
 
 
 def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
@@ -219,16 +223,11 @@ def _groups(fits: BallFits, optics: Optics) -> list[list[int]]:
 
 
 def _beside(known: BallFits, members: Int, optics: Optics, tees: Background | None) -> Background:
-    return lambda cols, rows: _images(known, members, optics, tees, cols, rows)[0]
+    return lambda cols, rows: images_beside(known, members, optics, tees, cols, rows)[0]
 
 
-def beside_balls(known: BallFits, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
-    """Return the images of the tees and of known balls at these pixels, and the pixels well under one of those balls."""
-    return _images(known, np.arange(0), optics, tees, cols, rows)
-
-
-def _images(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
-    """Images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
+def images_beside(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
+    """Return the images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
     total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
     doubtful: Bool = np.zeros(cols.shape, np.bool_)
     reach = known.radius_px + 4 * optics.sigma_px
@@ -296,7 +295,7 @@ def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel,
         last = fits
 
         def others(i: int, cols: Float, rows: Float, last: BallFits = last) -> tuple[Float, Bool]:
-            return _images(last, np.array([i]), optics, tees, cols, rows)[0], np.zeros(cols.shape, bool)
+            return images_beside(last, np.array([i]), optics, tees, cols, rows)[0], np.zeros(cols.shape, bool)
 
         fits = fit_at(film, fits.position_px, fits.radius_px, optics, noise, others)
     return fits

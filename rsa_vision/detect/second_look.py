@@ -17,7 +17,7 @@ from rsa_vision.detect.decide import over_clutter
 from rsa_vision.detect.find import distinct, fit_at, plausible, promising
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import Background, beside_balls, inside
+from rsa_vision.detect.resolve import Background, images_beside, inside
 from rsa_vision.types import Bool, Float
 
 _LEAST = 3  # balls that tell what one of them is like
@@ -60,7 +60,7 @@ def look_again(
     place = candidates.position_px[fitting & ~_near(candidates.position_px, balls, usual)]
 
     def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
-        return beside_balls(balls, optics, needles, cols, rows)
+        return images_beside(balls, np.arange(0), optics, needles, cols, rows)
 
     for quick in (True, False):
         if len(place) == 0:
