@@ -16,7 +16,7 @@ def odds(first: np.ndarray, second: np.ndarray, strangers: np.ndarray) -> np.nda
     of_ray = np.concatenate([first, second, strangers])
     n = len(of_ray)
     a, b = np.arange(pairs), pairs + np.arange(pairs)
-    looks = Looks(np.arange(n), of_ray, np.zeros(n, int), a, b, np.zeros(pairs), np.zeros(pairs))
+    looks = Looks(np.arange(n), of_ray, np.zeros(n, int), a, b, np.zeros(pairs), np.zeros(pairs), np.zeros(n))
     paired = (np.arange(n) < 2 * pairs).astype(float)
     probable = np.where(np.arange(pairs) < pairs - 1, 1.0, 1e-6)
     return log_odds_of_looks(looks, probable, images_alone(looks, paired), images_alone(looks.sizes, paired))
@@ -54,11 +54,11 @@ def test_an_error_far_above_the_usual_is_a_bound() -> None:
     """A crossing at 0.01 mm of an error of 0.3 mm: likelier a clear pair than its error says; one at 0.3 mm: not excluded."""
     both = np.array([0.01, 0.3])
     one, none = np.zeros(2, int), np.zeros(2)
-    crossings = Crossings(one, one, both, np.full(2, 0.3), none, none, none)
+    crossings = Crossings(one, one, both, np.full(2, 0.3), none, none, none, none)
     plain, bounded = crossings.log_ratio(), crossings.log_ratio(0.01)
     assert bounded[0] > plain[0] + 1
     assert plain[1] - 2 < bounded[1] < plain[1]
     np.testing.assert_allclose(crossings.log_ratio(0.2), plain)
     wide = np.linspace(0, 60, 600_001)
-    many = Crossings(*[np.zeros(len(wide), int)] * 2, wide, np.full(len(wide), 0.3), *[np.zeros(len(wide))] * 3)
+    many = Crossings(*[np.zeros(len(wide), int)] * 2, wide, np.full(len(wide), 0.3), *[np.zeros(len(wide))] * 4)
     assert abs(2 * np.trapezoid(np.exp(many.log_ratio(0.01)), wide) - 1) < 1e-3  # a density of the signed distance
