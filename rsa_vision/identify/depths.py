@@ -40,7 +40,7 @@ def log_chance_of_depths(depth: Float, met: Float, weight: Float) -> Float:
     reach = np.arange(-np.ceil(5 * width / STEP), np.ceil(5 * width / STEP) + 1) * STEP
     kernel = np.exp(-0.5 * (reach / width) ** 2)
     density = np.convolve(counts / counts.sum(), kernel / (kernel.sum() * STEP), mode="same")
-    return np.asarray(np.log(np.interp(depth, middle, density)))
+    return np.asarray(np.log(np.maximum(np.interp(depth, middle, density), np.finfo(float).tiny)))
 
 
 def log_odds_of_depths(depth: Float, log_chance: Float, a: Int, b: Int, pair: Float) -> Float:
