@@ -231,7 +231,12 @@ def _pair(
     if slant is not None:  # a ball seen at a slant is an ellipse, longer by 1 / cos: the fitted radius is the geometric mean
         radius_mm = radius_mm * np.sqrt(slant)
     quality = image_quality(table.points.flags[bundle.image])
-    return pair_rays(bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, quality=quality, slack_mm=slack_mm)
+    # the edge of a disc tells its radius about as well as its centre
+    sd_px = np.sqrt(np.trace(table.points.covariance_px2, axis1=1, axis2=2) / 2)
+    error = (sd_px / table.radius_px)[bundle.image]
+    return pair_rays(
+        bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, quality=quality, error=error, slack_mm=slack_mm
+    )
 
 
 def _pair_findings(pairing: Pairing, study: Study) -> list[Finding]:

@@ -77,7 +77,9 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
         parts = [np.log(unknown) + broad[k]]
         if weights[0].sum() > 0:
             n = float(weights[0].sum())
-            parts.append(np.log(n) + log_kernels(value[k], value[alike], weights[0][alike], np.hypot(widths, unsure[k]), n))
+            # unlike those of markers, their looks have no kind: how far they spread is not told by one or two
+            spread = np.hypot(np.hypot(widths, unsure[k]), wide / (2 * np.sqrt(n + 1)))
+            parts.append(np.log(n) + log_kernels(value[k], value[alike], weights[0][alike], spread, n))
         if weights[1].sum() > 0:
             parts.append(np.log(markers) + log_kernels(value[k], value[clear], weights[1][clear], widths, 2 * pairs))
         of_image[k] = np.logaddexp.reduce(parts) - np.log(weights[0].sum() + markers + unknown)

@@ -8,11 +8,11 @@ from scipy.special import gammaln
 from rsa_vision.types import Float
 
 
-def log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: float) -> float:
-    """Return the log of a kernel density estimate; kernels of half of Scott's width, since there may be several kinds of balls."""
+def log_kernels(value: Float, sample: Float, weight: Float, least: Float, n: float, scott: float = 0.5) -> float:
+    """Return the log of a kernel density estimate; kernels are half as wide as Scott's where there may be several kinds of balls."""
     middle = weight @ sample / weight.sum()
     spread = np.sqrt(weight @ (sample - middle) ** 2 / weight.sum())
-    width = np.hypot(least, 0.5 * max(n, 1.0) ** (-1 / 6) * spread)
+    width = np.hypot(least, scott * max(n, 1.0) ** (-1 / 6) * spread)
     kernels = (log_student((value - sample) / width, n) - np.log(width)).sum(axis=1)
     with np.errstate(divide="ignore"):
         return float(np.logaddexp.reduce(kernels + np.log(weight / weight.sum())))
@@ -27,9 +27,9 @@ def weighted_median(values: Float, weight: Float) -> Float:
     return result
 
 
-def log_student(t: Float, freedom: float) -> Float:
+def log_student(t: Float, freedom: Float | float) -> Float:
     """Return the log density of Student's t distribution, of two degrees of freedom at least."""
-    v = max(float(freedom), 2.0)
+    v = np.maximum(freedom, 2.0)
     scale = gammaln((v + 1) / 2) - gammaln(v / 2) - 0.5 * np.log(v * np.pi)
     result: Float = scale - (v + 1) / 2 * np.log1p(np.square(t) / v)
     return result

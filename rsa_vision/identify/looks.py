@@ -10,6 +10,7 @@ import numpy as np
 from rsa_vision.types import Float, Int
 
 LEARNT_FROM: Final = 3.0  # pairs (sum of their probabilities) that teach what pairs look like
+FAINT: Final = 1e-3  # pairs less probable than that teach nothing
 KIND: Final = np.array([0.03, 0.05])  # sd of sizes and contrasts within a kind of ball
 WIDE: Final = np.array([0.7, 0.7])  # sd of sizes and contrasts of any images
 UNSURE: Final = np.array([0.2, 0.4])  # error of the logs of size and contrast of an image that is not clear
@@ -32,6 +33,8 @@ class Looks:
         The rays of every crossing.
     grown_a, grown_b : ndarray of shape (m,)
         Log of the factor by which a marker at the crossing is smaller than its images.
+    error : ndarray of shape (n,)
+        Of the logs of size and contrast of every ray's image, by noise; 0 where it is not known.
     """
 
     image: Int
@@ -41,11 +44,13 @@ class Looks:
     b: Int
     grown_a: Float
     grown_b: Float
+    error: Float
 
     @property
     def unsure(self) -> Float:
         """Error of the look of every ray, shape (n, 2)."""
-        result: Float = np.where((self.quality > 0)[:, None], UNSURE[: self.of_ray.shape[1]], 0.0)
+        unclear = np.where((self.quality > 0)[:, None], UNSURE[: self.of_ray.shape[1]], 0.0)
+        result: Float = np.hypot(unclear, self.error[:, None])
         return result
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 
 from rsa_vision.identify.alone import Alone
 from rsa_vision.identify.densities import log_kernels, log_student, weighted_median
-from rsa_vision.identify.looks import KIND, LEARNT_FROM, WIDE, Looks
+from rsa_vision.identify.looks import FAINT, KIND, LEARNT_FROM, WIDE, Looks
 from rsa_vision.types import Bool, Float, Int
 
 USUAL: Final = np.array([0.05, 0.10])  # sd of the ratio of sizes, and of contrasts: a guess that weighs like USUAL_COUNT pairs
@@ -23,7 +23,6 @@ SLOPE: Final = 0.1  # of log size against log contrast, sd; 0.5 would leave the 
 UNLIKE: Final = (0.5, 10.0)  # pairs that do not look like one (bone before one image, a film's toe), of all: as HIDDEN
 NEW_KIND: Final = (0.5, 10.0)  # markers of a size or contrast that no other has, of all: as HIDDEN
 FAR: Final = 4.0  # spreads from which a pair does not look like one
-FAINT: Final = 1e-3  # pairs less probable than that teach nothing
 PRESUMED: Final = 0.5  # pairs that each model describes, beside those at hand (Jeffreys)
 TURNS: Final = 4  # of estimates that depend on each other: slope and spread, models and their parts
 
@@ -74,13 +73,14 @@ def _log_like(looks: Looks, pair: Float, alone: Alone, *, contrast: bool) -> tup
     known_a: Bool = np.array(np.isfinite(first).all(axis=1))
     known_b: Bool = np.array(np.isfinite(second).all(axis=1))
     unsure_a, unsure_b = looks.unsure[looks.a], looks.unsure[looks.b]
-    # what a marker looks like is told by both images, or by the one that is known, or clear
-    weight_a = np.where(known_a, np.where(unsure_a[:, 0] > 0, 1e-3, 1.0), 0.0)[:, None]
-    weight_b = np.where(known_b, np.where(unsure_b[:, 0] > 0, 1e-3, 1.0), 0.0)[:, None]
+    # what a marker looks like is told by both images, as well as each is known
+    weight_a = np.where(known_a, 1 / (KIND[0] ** 2 + unsure_a[:, 0] ** 2), 0.0)[:, None]
+    weight_b = np.where(known_b, 1 / (KIND[0] ** 2 + unsure_b[:, 0] ** 2), 0.0)[:, None]
     both = np.maximum(weight_a + weight_b, 1e-9)
     unsure = np.hypot(weight_a * unsure_a, weight_b * unsure_b) / both
     of_ratio = np.hypot(unsure_a, unsure_b)
-    teachers = np.flatnonzero(known_a & known_b & ~unsure_a.any(axis=1) & ~unsure_b.any(axis=1) & (pair > FAINT))
+    clear = looks.quality == 0
+    teachers = np.flatnonzero(known_a & known_b & clear[looks.a] & clear[looks.b] & (pair > FAINT))
     models, unlike = np.zeros((len(pair), 3 if contrast else 2)), np.zeros(len(pair))
     weights = pair[teachers] * ((looks.a[teachers] != looks.a[:, None]) & (looks.b[teachers] != looks.b[:, None]))
     told = (known_a | known_b) & (weights.sum(axis=1) >= LEARNT_FROM)

@@ -17,7 +17,8 @@ from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.alone import images_alone
 from rsa_vision.identify.crossings import Crossings, Region, common_error, find_crossings
 from rsa_vision.identify.densities import weighted_median
-from rsa_vision.identify.looks import Looks
+from rsa_vision.identify.depths import log_odds_of_depths
+from rsa_vision.identify.looks import UNSURE, Looks
 from rsa_vision.identify.packing import Packing, components, pack
 from rsa_vision.identify.pair_looks import log_odds_of_looks
 from rsa_vision.settings import Limits
@@ -78,6 +79,7 @@ def pair_rays(
     radius_mm: Float | None = None,
     contrast: Float | None = None,
     quality: Int | None = None,
+    error: Float | None = None,
     slack_mm: float | None = None,
 ) -> Pairing:
     """Find the rays that belong to one marker.
@@ -95,6 +97,8 @@ def pair_rays(
     contrast : ndarray of shape (n,), optional
     quality : ndarray of int, shape (n,), optional
         How well the image was fitted: 0 clear, 1 disturbed, 2 not described by the model; default: all alike.
+    error : ndarray of shape (n,), optional
+        Of the logarithms of radius and contrast, by noise; default: too small to matter.
     slack_mm : float, optional
         Systematic error of the rays; default: estimated from the crossings.
 
@@ -110,16 +114,18 @@ def pair_rays(
     slack = common_error(crossings) if slack_mm is None else slack_mm
     crossings = crossings.with_slack(slack)
     crossings = crossings.rows(crossings.distance_mm < limits.crossing_sigma * crossings.sigma_mm)
-    known = _looks(bundle, crossings, radius_mm, contrast, quality)
+    known = _looks(bundle, crossings, radius_mm, contrast, quality, error)
     foci = len(np.unique(bundle.focus))
     groups, share, membership = _groups(bundle, crossings, foci)
     claims = [tuple(sorted(set(bundle.image[list(group)].tolist()))) for group in groups]
-    look, of_quality = np.zeros(len(crossings)), np.zeros(len(bundle))
+    look, place, of_quality = np.zeros(len(crossings)), np.zeros(len(crossings)), np.zeros(len(bundle))
+    scale, freedom = np.ones(len(crossings)), np.full(len(crossings), 1e6)
+    unsaid = float(np.log(len(bundle) / len(images)))  # of which focus an image is: a pair needs one of each
     prior, usual_mm = 0.5, float(np.median(crossings.sigma_mm)) if len(crossings) else np.inf
     packing, gain = Packing(np.zeros(0, bool), np.zeros(0)), np.zeros(len(groups))
     for _ in range(ROUNDS):  # what pairs look like, and how many there are, from the pairs themselves
-        gain = share @ crossings.log_ratio(usual_mm) + membership @ look
-        gain += np.array([of_quality[list(g)].sum() + np.log(prior / (1 - prior)) * (len(g) - 1) for g in groups])
+        gain = share @ crossings.log_ratio(usual_mm, scale, freedom) + membership @ (look + place)
+        gain += np.array([of_quality[list(g)].sum() + (np.log(prior / (1 - prior)) - unsaid) * (len(g) - 1) for g in groups])
         packing = pack(claims, gain)
         prior = _fraction(groups, packing, len(images), foci)
         posterior = np.nan_to_num(packing.posterior)
@@ -130,9 +136,11 @@ def pair_rays(
         of_crossing = posterior @ (membership > 0)
         if of_crossing.sum() > 0:
             usual_mm = float(weighted_median(crossings.sigma_mm[:, None], of_crossing)[0])
+        scale, freedom = crossings.scale_of_errors(of_crossing, usual_mm)
         looks = known.as_usual_here(of_crossing)
         alone = images_alone(looks, of_ray)
         crossings = crossings.among(neighbours, (1 - of_ray) + alone.hidden * of_ray)
+        place = log_odds_of_depths(crossings.log_depth, crossings.log_chance, crossings.a, crossings.b, of_crossing)
         look, of_quality = log_odds_of_looks(looks, of_crossing, alone, images_alone(looks.sizes, of_ray)), alone.log_quality
     found = _pairing(bundle, crossings, groups, membership, packing, images, limits, slack)
     contested = _contested(claims, {claims[groups.index(g)] for g, doubt in zip(found.groups, found.ambiguous, strict=True) if doubt})
@@ -145,12 +153,15 @@ def _contested(claims: list[tuple[int, ...]], ambiguous: set[tuple[int, ...]]) -
     return linked if len(linked) <= MOST_CONTESTED else []
 
 
-def _looks(bundle: RayBundle, crossings: Crossings, radius_mm: Float | None, contrast: Float | None, quality: Int | None) -> Looks:
+def _looks(
+    bundle: RayBundle, crossings: Crossings, radius_mm: Float | None, contrast: Float | None, quality: Int | None, error: Float | None
+) -> Looks:
     known = [np.full(len(bundle), np.nan) if values is None else values for values in (radius_mm, contrast)]
     with np.errstate(invalid="ignore", divide="ignore"):
         of_ray = np.log(np.stack(known, axis=1))
     quality = np.zeros(len(bundle), np.int64) if quality is None else quality
-    return Looks(bundle.image, of_ray, quality, crossings.a, crossings.b, crossings.grown_a, crossings.grown_b)
+    error = np.zeros(len(bundle)) if error is None else np.clip(np.nan_to_num(error), 0.0, UNSURE[0])
+    return Looks(bundle.image, of_ray, quality, crossings.a, crossings.b, crossings.grown_a, crossings.grown_b, error)
 
 
 def _groups(bundle: RayBundle, crossings: Crossings, foci: int) -> tuple[list[tuple[int, ...]], Float, Float]:

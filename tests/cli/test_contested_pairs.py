@@ -20,7 +20,7 @@ from rsa_vision.types import Float
 from synthetic.point_films import Objects, expose, random_exposure
 from tests.identify.bodies import random_body
 
-SEEDS = (111, 117, 173, 196, 198)  # doubtful pairs; of the last three the likelier ones are wrong
+SEEDS = (117, 173, 196, 198, 205)  # doubtful pairs; of the last three the likelier ones are wrong
 SIGMAS = 5.0
 
 
@@ -69,7 +69,7 @@ def test_segments_decide_doubtful_pairs_rightly(seed: int) -> None:
         place, sd = (np.array([row[f"{part}{axis}_mm"] for axis in "xyz"]) for part in ("", "sd_"))
         assert (np.abs(place - true[f"{row['segment']}/{row['marker']}"]) < SIGMAS * sd).all()
     assert {f"{row['segment']}/{row['marker']}" for row in named["markers"]} == set(true)
-    assert (pairs_of(named) == pairs_of(rows)) == (seed < 173)
+    assert (pairs_of(named) == pairs_of(rows)) == (seed < 196)
     objects = [row for row in named["images"] if row["role"] == "object"]
     assert all(row["used"] and row["x_mm"] is not None and row["residual_um"] is not None and row["focus"] in (1, 2) for row in objects)
 

@@ -344,7 +344,7 @@ def test_the_only_marker_of_its_size_is_no_pair_of_strangers_if_both_images_agre
         of_ray = np.concatenate([kind + rng.normal(0, 0.02, kind.shape), rng.normal(0.3, 0.7, (strangers, 2))])
         n = len(of_ray)
         a, b = np.append(np.arange(0, 2 * pairs, 2), n - 2), np.append(np.arange(1, 2 * pairs, 2), n - 1)
-        looks = Looks(np.arange(n), of_ray, np.zeros(n, int), a, b, np.zeros(len(a)), np.zeros(len(a)))
+        looks = Looks(np.arange(n), of_ray, np.zeros(n, int), a, b, np.zeros(len(a)), np.zeros(len(a)), np.zeros(n))
         paired = (np.arange(n) < 2 * pairs).astype(float)
         odds = log_odds_of_looks(looks, np.append(np.ones(pairs), 1e-6), images_alone(looks, paired), images_alone(looks.sizes, paired))
         assert (odds[1:pairs] > 2).all()
