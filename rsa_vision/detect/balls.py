@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,16 @@ import numpy as np
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import Patches
 from rsa_vision.detect.profiles import BallTable, ball_table
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are what is looked for
-_STEPS = 12
-_REWEIGHTED = (2, 5)  # steps
+_STEPS, _QUICK_STEPS = 12, 4
+_REWEIGHTED = (1, 3)  # steps
+_FADED = 4.0  # blur widths beyond the rim where nothing is left of a ball's image that noise would let be seen
 _BATCH = 40  # windows that stay in the cache
 _LARGE_PX = 27  # side of a window of which a first look does not need every pixel
 _CONVERGED_PX = 2e-4
+_NEAR_PX = 5e-3  # enough for a first look
 _MAX_STEP_PX = 0.7
 _RIDGE = 1e-10  # relative
 
@@ -140,7 +143,7 @@ def fit_balls(
     extra : ndarray of shape (n, s, s), optional
         Images of neighbours, in film values, to be subtracted first.
     quick : bool
-        For a first look: a third of the steps, and covariances as if the noise were white.
+        For a first look: a third of the steps at most, and covariances as if the noise were white.
     sparse : bool
         For a first look at much that is nothing: of large windows only every second pixel either way.
 
@@ -170,87 +173,90 @@ def _fit_batch(
     stride: int,
 ) -> BallFits:
     n, size = len(start_px), patches.size
-    kind = np.float32 if quick else np.float64  # a first look does with half the memory
     half = size // 2
     table = ball_table(round(mu_px * sigma_px, 3))
-    data = patches.values if extra is None else patches.values - extra
-    data = data.reshape(n, -1)
-    valid = patches.valid.reshape(n, -1)
-    axis = np.arange(half % stride, size, stride, dtype=np.float64)
-    grid_c, grid_r = (g.ravel() for g in np.meshgrid(axis, axis))
-    looked_at = (grid_r * size + grid_c).astype(np.intp)
-    if stride > 1:
-        data, valid = data[:, looked_at], valid[:, looked_at]
-    level = patches.values.reshape(n, -1).mean(1)[:, None]  # what is small can be added up in single precision
-    data, valid = (data - level).astype(kind), valid.astype(kind)
-    added = level if extra is None else level + extra.reshape(n, -1)[:, looked_at]
-    surface = polynomial(half, grid_c - half, grid_r - half)
+    pixels = _pixels(size, stride)
+    values = patches.values.reshape(n, -1)
+    level = values.mean(1)[:, None]
+    beside = level if extra is None else level + extra.reshape(n, -1)[:, pixels.place]
+    # single precision does once the level is off; what is summed up is summed up in double
+    data = (values[:, pixels.place] - beside).astype(np.float32)
+    valid = patches.valid.reshape(n, -1)[:, pixels.place].astype(np.float32)
     local = start_px - patches.corner_px
     low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px, half - sigma_px)
     radius = np.clip(start_radius_px, low, high)
-    weight = valid / noise.variance_at(level).astype(kind)
-    squares = (surface[:, :, None] * surface[:, None]).reshape(len(surface), -1)
-    equations = _Equations(table, sigma_px, grid_c.astype(kind), grid_r.astype(kind), surface, squares)
-    theta = np.zeros((n, 7))
+    depth = np.zeros(n)
     converged = np.zeros(n, bool)
-    busy = np.arange(n)
-    for step in range(4 if quick else _STEPS):
-        now, seen = weight[busy], data[busy]
-        images = equations.images(local[busy], radius[busy])
-        if step in _REWEIGHTED:  # the variance follows the expected value once the model is near
-            model = _model(images, surface, theta[busy])
-            now = weight[busy] = valid[busy] / noise.variance_at(model + added[busy]).astype(kind)
-        normal, right = equations.normal(images, now, seen)
+
+    def images(of: Any) -> Float:
+        far = np.hypot(*(local[of] - half).T) + radius[of] + _FADED * sigma_px
+        reached = int(np.searchsorted(pixels.distance, far.max()))
+        dx, dy = (axis[:reached] - at[:, None] for axis, at in zip((pixels.cols, pixels.rows), local[of].T.astype(np.float32), strict=True))
+        value, *by = slopes(table, dx, dy, radius[of], sigma_px)
+        return np.stack([*by, value], axis=1)
+
+    equations = _Equations(pixels.surface, data, valid / noise.variance_at(level).astype(np.float32))
+    busy: Any = slice(None)
+    reweighted = _REWEIGHTED[:1] if quick else _REWEIGHTED
+    for step in range(_QUICK_STEPS if quick else _STEPS):
+        seen = images(busy)
+        if step in reweighted:  # the variance follows the expected value once the model is near
+            model = equations.model(seen, depth) + beside
+            equations = _Equations(pixels.surface, data, valid / noise.variance_at(model).astype(np.float32))
+        normal, right, _ = equations.normal(seen, busy, damping=1e-6)
         if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
-            theta = _solve(normal[:, 3:, 3:], right[:, 3:])
-        right = right - np.matmul(normal[:, :, 3:], theta[busy, :, None])[:, :, 0]  # of what the model leaves
-        delta = _solve(normal, right, damping=1e-6) / _by_depth(theta[busy])
+            depth = right[:, 3] / normal[:, 3, 3]
+        by = _by_depth(depth[busy])
+        delta = np.linalg.solve(normal, right[:, :, None] - normal[:, :, 3:] * depth[busy, None, None])[:, :, 0] / by
         scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(delta[:, :3]).max(1), 1e-12))[:, None]
         local[busy] = np.clip(local[busy] + scale * delta[:, :2], 1.0, size - 2.0)
         radius[busy] = np.clip(radius[busy] + (scale * delta[:, 2:3])[:, 0], low, high)
-        theta[busy] += scale * delta[:, 3:]
+        depth[busy] += (scale * delta[:, 3:])[:, 0]
         converged[busy] = np.abs(delta[:, :2]).max(1) < _CONVERGED_PX * 10
-        moving = (np.abs(delta[:, :3]) >= _CONVERGED_PX).any(1)
-        if not moving.any():
-            break
-        if step >= _REWEIGHTED[-1]:
-            busy = busy[moving]
-    images = equations.images(local, radius)
-    normal, right = equations.normal(images, weight, data)
-    # the rest is added to what is known: no digits are lost in it
-    theta = theta + _solve(normal[:, 3:, 3:], right[:, 3:] - np.matmul(normal[:, 3:, 3:], theta[:, :, None])[:, :, 0])
-    residual = data - _model(images, surface, theta)
-    whole, of_depth = invert(normal)[:, :4], invert(normal[:, 3:, 3:])[:, :1]
-    by = _by_depth(theta)
-    covariance = whole / (by[:, :4, None] * by[:, None])
-    variance = of_depth[:, 0, 0] / stride**2
-    if not quick:
-        of_all = np.concatenate([whole / by[:, :4, None], np.pad(of_depth, ((0, 0), (0, 0), (3, 0)))], axis=1)
-        influence = (np.matmul(of_all[:, :, :4], images) + of_all[:, :, 4:] @ surface.T) * np.sqrt(weight, dtype=np.float64)[:, None]
-        scatter = influence_covariance(influence.reshape(n, 5, size, size), noise.correlation)
-        covariance, variance = scatter[:, :4], scatter[:, 4, 4]
-    core = _distance(grid_c - local[:, :1], grid_r - local[:, 1:]) < (radius + sigma_px)[:, None]
+        moving = (np.abs(delta[:, :3]) >= (_NEAR_PX if quick else _CONVERGED_PX)).any(1)
+        if step >= reweighted[-1]:
+            busy = np.arange(n)[busy][moving]
+            if len(busy) == 0:
+                break
+    seen = images(slice(None))
+    normal, right, taken = equations.normal(seen, slice(None))
+    depth = right[:, 3] / normal[:, 3, 3]
+    weight, reached = equations.weight, seen.shape[2]
+    residual = data - equations.model(seen, depth)
+    by = _by_depth(depth)
+    whole = invert(normal) / by[:, :, None]
+    covariance = whole / by[:, None]
+    variance = 1 / normal[:, 3, 3] / stride**2
+    core = _distance(pixels.cols[:reached] - local[:, :1], pixels.rows[:reached] - local[:, 1:]) < (radius + sigma_px)[:, None]
     square = weight * residual**2
-    core_n = np.maximum((core * valid).sum(1), 1.0)
-    chi2_core = (square * core).sum(1) / core_n
-    chi2_ring = chi2_uneven = (square * ~core).sum(1) / np.maximum((~core * valid).sum(1) - 10, 1.0)
+    counted = (core * valid[:, :reached]).sum(1)
+    core_n = np.maximum(counted, 1.0)
+    left, total = ((v).sum(1, dtype=np.float64) for v in (square[:, :reached] * core, square))
+    raised = weight[:, :reached] * (residual[:, :reached] + depth[:, None].astype(np.float32) * seen[:, 3]) ** 2 * core
+    chi2_ring = chi2_uneven = (total - left) / np.maximum(valid.sum(1) - counted - 10, 1.0)
     if not quick:
-        chi2_ring, chi2_uneven = (uneven(residual, weight, local, size, part) for part in (~core, core))
-    raised = weight * (residual + theta[:, :1] * images[:, 3]) ** 2  # over the fitted background, as if there were no ball
+        of_all = np.concatenate([whole, np.pad(1 / normal[:, 3:, 3:], ((0, 0), (0, 0), (3, 0)))], axis=1)
+        influence = np.matmul(of_all, -np.matmul(taken, pixels.surface.T))
+        influence[:, :, :reached] += np.matmul(of_all, seen)
+        influence *= np.sqrt(weight)[:, None]
+        scatter = influence_covariance(influence[:, :, pixels.back].reshape(n, 5, size, size), noise.correlation)
+        covariance, variance = scatter[:, :4, :4], scatter[:, 4, 4]
+        under = np.pad(core, ((0, 0), (0, size * size - reached)))[:, pixels.back]
+        chi2_ring, chi2_uneven = (uneven(residual[:, pixels.back], weight[:, pixels.back], local, size, part) for part in (~under, under))
     return BallFits(
         position_px=local + patches.corner_px,
         radius_px=radius,
-        depth=theta[:, 0],
-        covariance=covariance[:, :, :4],
-        chi2_core=chi2_core,
+        depth=depth,
+        covariance=covariance,
+        chi2_core=left / core_n,
         chi2_ring=chi2_ring,
         chi2_uneven=chi2_uneven,
-        explained=1.0 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
-        valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
-        window_fraction=valid.mean(1),
-        log_likelihood=-0.5 * square.sum(1),
-        background=theta[:, 1] + level[:, 0],
-        significance=np.abs(theta[:, 0]) / np.sqrt(np.maximum(variance, 1e-30)),
+        explained=1.0 - left / np.maximum(raised.sum(1, dtype=np.float64), 1e-12),
+        valid_fraction=counted / np.maximum(core.sum(1), 1),
+        window_fraction=valid.mean(1, dtype=np.float64),
+        log_likelihood=-0.5 * total,
+        background=equations.background(seen, depth)[:, 0] + level[:, 0],
+        significance=np.abs(depth) / np.sqrt(np.maximum(variance, 1e-30)),
         n_core=core_n,
         converged=converged,
     )
@@ -290,26 +296,22 @@ def _distance(dx: Float, dy: Float) -> Float:
     return np.asarray(np.sqrt(dx * dx + dy * dy))  # a fifth of the time of hypot, which minds overflow
 
 
-def slopes(
-    table: BallTable, dx: Float, dy: Float, radius: Float, sigma_px: float, kind: Any = np.float64
-) -> tuple[Float, Float, Float, Float]:
+def slopes(table: BallTable, dx: Float, dy: Float, radius: Float, sigma_px: float) -> tuple[Float, Float, Float, Float]:
     """Return the images of balls and their derivatives.
 
     Parameters
     ----------
     table : BallTable
     dx, dy : ndarray of shape (n, p)
-        Pixels from the centres.
+        Pixels from the centres; their kind is that of the result.
     radius : ndarray of shape (n,)
     sigma_px : float
-    kind : dtype, optional
-        Of the result.
 
     Returns
     -------
     value, by_dx, by_dy, by_radius : ndarrays of shape (n, p)
     """
-    dx, dy = dx.astype(kind), dy.astype(kind)
+    kind = dx.dtype.type
     rho = _distance(dx, dy)
     value, slope, slope_r = table.evaluate(rho / kind(sigma_px), radius / sigma_px)
     slope /= kind(sigma_px) * np.maximum(rho, kind(1e-9))
@@ -339,47 +341,81 @@ def derivatives(radius: Float, half: int, sigma_px: float, mu_px: float) -> Floa
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Equations:
-    """Least squares in windows: balls of depth one, their derivatives, and the background that the windows have in common."""
+class _Pixels:
+    """Pixels of a window that are looked at, in the order of their distance from its middle: a ball reaches only the first of them.
 
-    table: BallTable
-    sigma_px: float
-    cols: Float  # (p,), of the kind to calculate with
+    Attributes
+    ----------
+    place, back : ndarray of int, shape (p,)
+        Where they lie in the window, and where its pixels are among them (of windows of which all are looked at).
+    cols, rows, distance : ndarray of shape (p,)
+    surface : ndarray of shape (p, 6)
+        The background's monomials.
+    """
+
+    place: Int
+    back: Int
+    cols: Float
     rows: Float
-    surface: Float  # (p, k)
-    squares: Float  # (p, k * k), products of its columns
+    distance: Float
+    surface: Float
 
-    def images(self, local: Float, radius: Float) -> Float:
-        """Return derivatives by col (negative), row (negative) and radius, and the images themselves, shape (n, 4, p)."""
-        value, *by = slopes(self.table, self.cols - local[:, :1], self.rows - local[:, 1:], radius, self.sigma_px, self.cols.dtype.type)
-        return np.stack([*by, value], axis=1)
 
-    def normal(self, images: Float, weight: Float, target: Float) -> tuple[Float, Float]:
-        """Return normal matrices (n, 10, 10) and right sides (n, 10)."""
+@lru_cache(maxsize=64)
+def _pixels(size: int, stride: int) -> _Pixels:
+    half = size // 2
+    axis = np.arange(half % stride, size, stride)
+    cols, rows = (g.ravel() for g in np.meshgrid(axis, axis))
+    distance = np.hypot(cols - half, rows - half)
+    order = np.argsort(distance, kind="stable")
+    cols, rows = cols[order], rows[order]
+    single = (axis.astype(np.float32) for axis in (cols, rows))
+    return _Pixels(rows * size + cols, np.argsort(order), *single, distance[order], polynomial(half, cols - half, rows - half))
+
+
+class _Equations:
+    """Least squares for balls of depth one in windows, the background's coefficients eliminated.
+
+    Parameters
+    ----------
+    surface : ndarray of shape (p, 6)
+    data, weight : ndarray of shape (n, p)
+    """
+
+    def __init__(self, surface: Float, data: Float, weight: Float) -> None:
+        self.surface, self.data, self.weight = surface, data, weight
+        squares = (surface[:, :, None] * surface[:, None]).reshape(len(surface), -1)
+        self.inverse = invert((weight @ squares).reshape(len(data), *[surface.shape[1]] * 2))
+        self.right = (weight * data) @ surface
+
+    def normal(self, images: Float, of: Any, damping: float = _RIDGE) -> tuple[Float, Float, Float]:
+        """Return normal matrices (n, 4, 4) and right sides (n, 4) of some windows, and what backgrounds take of the images (n, 4, 6)."""
         # added up in double precision: radius and depth of a ball that is small against the blur can all but stand for each other
-        n, k = len(images), self.surface.shape[1]
-        weight, images = weight.astype(np.float64), images.astype(np.float64)
-        weighted = images * weight[:, None]
-        mixed = (weighted.reshape(4 * n, -1) @ self.surface).reshape(n, 4, k)
+        n, _, reached = images.shape
+        images = images.astype(np.float64)
+        weighted = images * self.weight[of, None, :reached]
+        mixed = (weighted.reshape(4 * n, -1) @ self.surface[:reached]).reshape(n, 4, -1)
+        taken = np.matmul(mixed, self.inverse[of])
         own = np.matmul(weighted, images.transpose(0, 2, 1))
-        normal = np.block([[own, mixed], [mixed.transpose(0, 2, 1), (weight @ self.squares).reshape(n, k, k)]])
-        return normal, np.concatenate([np.matmul(weighted, target[:, :, None])[:, :, 0], (weight * target) @ self.surface], axis=1)
+        own[:, *np.diag_indices(4)] = np.maximum(own[:, *np.diag_indices(4)] * (1 + damping), 1e-30)
+        normal = own - np.matmul(taken, mixed.transpose(0, 2, 1))
+        right = np.matmul(weighted, self.data[of, :reached, None]) - np.matmul(taken, self.right[of, :, None])
+        return normal, right[:, :, 0], taken
+
+    def background(self, images: Float, depth: Float) -> Float:
+        """Return the background's coefficients for balls of these depths, shape (n, 6)."""
+        reached = images.shape[2]
+        of_balls = (self.weight[:, :reached] * images[:, 3] * depth[:, None]) @ self.surface[:reached]
+        return np.matmul(self.inverse, (self.right - of_balls)[:, :, None])[:, :, 0]
+
+    def model(self, images: Float, depth: Float) -> Float:
+        """Return what is expected in every pixel, shape (n, p)."""
+        out = (self.background(images, depth) @ self.surface.T).astype(np.float32)
+        out[:, : images.shape[2]] += depth[:, None].astype(np.float32) * images[:, 3]
+        return out
 
 
-def _model(images: Float, surface: Float, theta: Float) -> Float:
-    kind = images.dtype
-    return np.asarray(theta[:, :1].astype(kind) * images[:, 3] + theta[:, 1:].astype(kind) @ surface.T.astype(kind))
-
-
-def _by_depth(theta: Float) -> Float:
-    """What the derivatives of balls of depth one are to be multiplied by, shape (n, 10)."""
-    depth = np.where(theta[:, :1] == 0, 1e-30, theta[:, :1])
-    return np.concatenate([-depth, -depth, depth, np.ones_like(theta)], axis=1)
-
-
-def _solve(normal: Float, right: Float, damping: float = 1e-9) -> Float:
-    scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
-    scaled = normal / (scale[:, :, None] * scale[:, None, :])
-    scaled[:, np.arange(scaled.shape[1]), np.arange(scaled.shape[1])] += damping
-    solution: Float = np.linalg.solve(scaled, (right / scale)[:, :, None])[:, :, 0] / scale
-    return solution
+def _by_depth(depth: Float) -> Float:
+    """What the derivatives of balls of depth one are to be multiplied by, shape (n, 4)."""
+    depth = np.where(depth == 0, 1e-30, depth)
+    return np.stack([-depth, -depth, depth, np.ones_like(depth)], axis=1)

@@ -84,10 +84,11 @@ class BallTable:
         left = col.astype(np.intp)
         part = col - left.astype(kind)
         reach = int(left.max(initial=0)) + 2
-        line = (self.nodes[:, top, :reach] * (1 - frac) + self.nodes[:, top + 1, :reach] * frac).reshape(3, -1).astype(kind)
+        low, high = self.nodes[:, top, :reach], self.nodes[:, top + 1, :reach]
+        line = (low + frac * (high - low)).reshape(3, -1).astype(kind)
+        rise = np.diff(line, append=0)
         index = left + (np.arange(len(y)) * reach).reshape((-1,) + (1,) * (x.ndim - 1))
-        low = line.take(index, axis=1)
-        value, d_rho, d_radius = low + part * (line.take(index + 1, axis=1) - low)
+        value, d_rho, d_radius = line.take(index, axis=1) + part * rise.take(index, axis=1)
         return value, d_rho, d_radius
 
 
