@@ -88,8 +88,10 @@ def join(parts: list[BallFits]) -> BallFits:
 
 
 def half_size(radius_px: float, sigma_px: float) -> int:
-    """Return the half side of a window that holds a ball and enough background to tell it from its curvature."""
-    return int(np.ceil(1.9 * radius_px + 3.0 * sigma_px + 2.0))
+    """Return the half side of a window that holds a ball and enough background to tell it from its curvature; few sizes, many at once."""
+    half = int(np.ceil(1.9 * radius_px + 3.0 * sigma_px + 2.0))
+    step = max(1, half // 8)
+    return -(-half // step) * step
 
 
 def polynomial(axis_scale: float, dx: Float, dy: Float) -> Float:
