@@ -15,7 +15,7 @@ from rsa_vision.types import Bool, Float, Int
 
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are what is looked for
 _STEPS, _QUICK_STEPS = 12, 4
-_REWEIGHTED = (1, 3)  # steps
+_REWEIGHTED = (1, 2)  # steps
 _FADED = 4.0  # blur widths beyond the rim where nothing is left of a ball's image that noise would let be seen
 _BATCH = 40  # windows that stay in the cache
 _LARGE_PX = 27  # side of a window of which a first look does not need every pixel

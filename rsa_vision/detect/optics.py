@@ -74,12 +74,14 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     position, radius = position[chosen], radius[chosen]
     sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen)) for t in trials])
     # what came close at another blur only, as two balls in one at a wide one, is none of the film's balls
-    close = _closeness(fit(sigma, KAPPA), noise)
+    fits = fit(sigma, KAPPA)
+    close = _closeness(fits, noise)
     kept = close < max(_CLOSE, _UNLIKE * float(np.sort(close)[len(close) // 4]))
     if not kept.all():
-        chosen, position, radius = chosen[kept], position[kept], radius[kept]
-        sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen)) for t in trials])
-    return _most_likely(film, fit(sigma, KAPPA), Optics(sigma, KAPPA / sigma), noise)
+        position, radius = position[kept], radius[kept]
+        sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen[kept])) for t in trials])
+        fits = fit(sigma, KAPPA)
+    return _most_likely(film, fits, Optics(sigma, KAPPA / sigma), noise)
 
 
 def _most_likely(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel) -> tuple[Optics, float]:
@@ -89,7 +91,6 @@ def _most_likely(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
     divided by what the model leaves of it, as if the variance of each were unknown: bone under it and errors of the model are no noise.
     """
     halves = np.ceil(fits.radius_px + 2.5 * optics.sigma_px + 1)
-    fits = fit_at(film, fits.position_px, fits.radius_px, optics, noise, quick=True)
     first = fits
     now = _equations(film, fits, first, halves, optics, noise)
     expected = np.array([[1.0, 0.0], [-1.0, 1.0]]) / _EXPECTED[:, None]
