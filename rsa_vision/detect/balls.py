@@ -10,14 +10,13 @@ import numpy as np
 
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import Patches
-from rsa_vision.detect.profiles import BallTable, ball_table
+from rsa_vision.detect.profiles import BallTable, Optics, ball_table
 from rsa_vision.types import Bool, Float, Int
 
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are what is looked for
 _STEPS, _QUICK_STEPS = 12, 4
 _REWEIGHTED = (1, 2)  # steps
 _FADED = 4.0  # blur widths beyond the rim where nothing is left of a ball's image that noise would let be seen
-_BATCH = 40  # windows that stay in the cache
 _LARGE_PX = 27  # side of a window of which a first look does not need every pixel
 _CONVERGED_PX = 2e-4
 _NEAR_PX = 5e-3  # enough for a first look
@@ -88,10 +87,8 @@ def join(parts: list[BallFits]) -> BallFits:
 
 
 def half_size(radius_px: float, sigma_px: float) -> int:
-    """Return the half side of a window that holds a ball and enough background to tell it from its curvature; few sizes, many at once."""
-    half = int(np.ceil(1.9 * radius_px + 3.0 * sigma_px + 2.0))
-    step = max(1, half // 8)
-    return -(-half // step) * step
+    """Return the half side of a window that holds a ball and enough background to tell it from its curvature."""
+    return int(np.ceil(1.9 * radius_px + 3.0 * sigma_px + 2.0))
 
 
 def polynomial(axis_scale: float, dx: Float, dy: Float) -> Float:
@@ -123,8 +120,8 @@ def fit_balls(
     patches: Patches,
     start_px: Float,
     start_radius_px: Float,
-    sigma_px: float,
-    mu_px: float,
+    halves: Int,
+    optics: Optics,
     noise: NoiseModel,
     extra: Float | None = None,
     *,
@@ -136,11 +133,14 @@ def fit_balls(
     Parameters
     ----------
     patches : Patches
+        Of a size that holds all windows.
     start_px : ndarray of shape (n, 2)
         (col, row) on the film.
     start_radius_px : ndarray of shape (n,)
-    sigma_px, mu_px : float
-        Blur (standard deviation) and attenuation of the film at hand.
+    halves : ndarray of int, shape (n,)
+        Half sides of the windows.
+    optics : Optics
+        Of the film at hand.
     noise : NoiseModel
     extra : ndarray of shape (n, s, s), optional
         Images of neighbours, in film values, to be subtracted first.
@@ -153,27 +153,8 @@ def fit_balls(
     -------
     BallFits
     """
-    parts = []
-    for begin in range(0, len(start_px), _BATCH):
-        part = slice(begin, begin + _BATCH)
-        chunk = Patches(patches.values[part], patches.valid[part], patches.corner_px[part])
-        more = None if extra is None else extra[part]
-        stride = 2 if sparse and patches.size > _LARGE_PX else 1
-        parts.append(_fit_batch(chunk, start_px[part], start_radius_px[part], sigma_px, mu_px, noise, more, quick, stride))
-    return join(parts)
-
-
-def _fit_batch(
-    patches: Patches,
-    start_px: Float,
-    start_radius_px: Float,
-    sigma_px: float,
-    mu_px: float,
-    noise: NoiseModel,
-    extra: Float | None,
-    quick: bool,
-    stride: int,
-) -> BallFits:
+    sigma_px, mu_px = optics.sigma_px, optics.mu_px
+    stride = 2 if sparse and patches.size > _LARGE_PX else 1
     n, size = len(start_px), patches.size
     half = size // 2
     table = ball_table(round(mu_px * sigma_px, 3))
@@ -183,9 +164,10 @@ def _fit_batch(
     beside = level if extra is None else level + extra.reshape(n, -1)[:, pixels.place]
     # single precision does once the level is off; what is summed up is summed up in double
     data = (values[:, pixels.place] - beside).astype(np.float32)
-    valid = patches.valid.reshape(n, -1)[:, pixels.place].astype(np.float32)
+    own = pixels.side <= halves[:, None]
+    valid = (patches.valid.reshape(n, -1)[:, pixels.place] & own).astype(np.float32)
     local = start_px - patches.corner_px
-    low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px, half - sigma_px)
+    low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), np.minimum(min(RADIUS_PX[1], 20.0 * sigma_px), halves - sigma_px)
     radius = np.clip(start_radius_px, low, high)
     depth = np.zeros(n)
     converged = np.zeros(n, bool)
@@ -212,7 +194,7 @@ def _fit_batch(
         delta = np.linalg.solve(normal, right[:, :, None] - normal[:, :, 3:] * depth[busy, None, None])[:, :, 0] / by
         scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(delta[:, :3]).max(1), 1e-12))[:, None]
         local[busy] = np.clip(local[busy] + scale * delta[:, :2], 1.0, size - 2.0)
-        radius[busy] = np.clip(radius[busy] + (scale * delta[:, 2:3])[:, 0], low, high)
+        radius[busy] = np.clip(radius[busy] + (scale * delta[:, 2:3])[:, 0], low, high[busy])
         depth[busy] += (scale * delta[:, 3:])[:, 0]
         converged[busy] = np.abs(delta[:, :2]).max(1) < _CONVERGED_PX * 10
         moving = (np.abs(delta[:, :3]) >= (_NEAR_PX if quick else _CONVERGED_PX)).any(1)
@@ -255,7 +237,7 @@ def _fit_batch(
         chi2_uneven=chi2_uneven,
         explained=1.0 - left / np.maximum(raised.sum(1, dtype=np.float64), 1e-12),
         valid_fraction=counted / np.maximum(core.sum(1), 1),
-        window_fraction=valid.mean(1, dtype=np.float64),
+        window_fraction=valid.sum(1, dtype=np.float64) / own.sum(1),
         log_likelihood=-0.5 * total,
         background=equations.background(seen, depth)[:, 0] + level[:, 0],
         significance=np.abs(depth) / np.sqrt(np.maximum(variance, 1e-30)),
@@ -350,7 +332,9 @@ class _Pixels:
     ----------
     place, back : ndarray of int, shape (p,)
         Where they lie in the window, and where its pixels are among them (of windows of which all are looked at).
-    cols, rows, distance : ndarray of shape (p,)
+    cols, rows : ndarray of shape (p,)
+    distance, side : ndarray of shape (p,)
+        From the middle, and the larger one of that along rows and columns.
     surface : ndarray of shape (p, 6)
         The background's monomials.
     """
@@ -360,6 +344,7 @@ class _Pixels:
     cols: Float
     rows: Float
     distance: Float
+    side: Int
     surface: Float
 
 
@@ -372,7 +357,8 @@ def _pixels(size: int, stride: int) -> _Pixels:
     order = np.argsort(distance, kind="stable")
     cols, rows = cols[order], rows[order]
     single = (axis.astype(np.float32) for axis in (cols, rows))
-    return _Pixels(rows * size + cols, np.argsort(order), *single, distance[order], polynomial(half, cols - half, rows - half))
+    dx, dy = cols - half, rows - half
+    return _Pixels(rows * size + cols, np.argsort(order), *single, distance[order], np.maximum(abs(dx), abs(dy)), polynomial(half, dx, dy))
 
 
 class _Equations:

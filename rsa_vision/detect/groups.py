@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, invert, polynomial, slopes, uneven
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, invert, polynomial, uneven
 from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
-from rsa_vision.detect.profiles import Optics, ball_table
+from rsa_vision.detect.profiles import ball_table
 from rsa_vision.types import Float
 
 _STEPS = 25
@@ -46,7 +46,7 @@ def fit_group(
     others : callable, optional
         ``others(cols, rows)``: images of neighbours outside the group, subtracted first.
     edge : bool
-        The background also holds an edge: any profile across the direction in which the window changes most (:func:`edge_profiles`).
+        The background also holds an edge: any profile across the direction in which the window changes most (:func:`edge_profile`).
 
     Returns
     -------
@@ -63,8 +63,7 @@ def fit_group(
     images = _images(window, surface, local, radius, sigma_px, mu_px)
     theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     if edge:
-        bare = data - images.value.T @ theta[:k]
-        surface = np.column_stack([surface, edge_profiles(bare[None], valid[None], sigma_px)[0].T])
+        surface = np.column_stack([surface, edge_profile(data - images.value.T @ theta[:k], valid, sigma_px)])
         images = _images(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     converged = False
@@ -117,56 +116,36 @@ def _estimator(weighted: Float) -> Float:
     return np.asarray(invert((weighted.T @ weighted)[None])[0] @ weighted.T)
 
 
-def edge_gain(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, others: Any) -> Float:
-    """Return twice the log-likelihoods that edges in the background would gain, to first order (the score test of Rao, 1948).
+def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None) -> float:
+    """Return twice the log-likelihood that an edge in the background would gain, to first order (the score test of Rao, 1948).
 
-    No fit is needed for it: what is left of a window by a ball that was fitted without an edge says how far one more step would get with
-    an edge and without. Neighbours are held as they are.
+    No fit is needed for it: what is left of the window by balls that were fitted without an edge says how far one more step would get with
+    an edge and without.
 
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
     fits : BallFits
-        As fitted without an edge.
-    optics : Optics
+        One group, as fitted without an edge.
+    sigma_px, mu_px : float
     noise : NoiseModel
-    others : callable
-        ``others(i, cols, rows)``: images of the neighbours of ball ``i``.
+    others : callable, optional
+        As of :func:`fit_group`.
 
     Returns
     -------
-    ndarray of shape (n,)
+    float
         As if the noise were white.
     """
-    out = np.zeros(len(fits.depth))
-    halves = np.array([half_size(r, optics.sigma_px) for r in fits.radius_px])
-    for half in np.unique(halves):
-        index = np.flatnonzero(halves == half)
-        patches = cut(film, fits.position_px[index], int(half), noise)
-        grid = np.mgrid[0 : patches.size, 0 : patches.size].reshape(2, -1).astype(np.float64)
-        cols, rows = (grid[::-1, None] + patches.corner_px.T[:, :, None]).astype(np.float64)
-        raw, valid = (a.reshape(len(index), -1) for a in (patches.values, patches.valid.astype(np.float64)))
-        weight = valid / noise.variance_at(raw)
-        dx, dy = cols - fits.position_px[index, :1], rows - fits.position_px[index, 1:]
-        table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
-        own = np.stack(slopes(table, dx, dy, fits.radius_px[index], optics.sigma_px), axis=1)
-        surface = polynomial(half, grid[1] - half, grid[0] - half).T
-        own = np.concatenate([own, np.broadcast_to(surface, (len(index), *surface.shape))], axis=1)
-        data = raw - np.stack([others(i, *at) for i, *at in zip(index, cols, rows, strict=True)])
-        fixed = np.delete(own, (1, 2, 3), axis=1)
-        theta = _least_squares(fixed, weight, data)[:, :, None]
-        edge = edge_profiles(data - theta[:, 0] * own[:, 0], valid, optics.sigma_px)
-        residual = data - (theta * fixed).sum(1)
-        each = np.concatenate([own, edge], axis=1)
-        explained = [np.einsum("np,nk,nkp->n", weight * residual, _least_squares(j, weight, residual), j) for j in (each, own)]
-        out[index] = explained[0] - explained[1]
-    return out
-
-
-def _least_squares(jac: Float, weight: Float, target: Float) -> Float:
-    """Solutions (n, k) of weighted least squares with derivatives (n, k, p)."""
-    weighted = jac * weight[:, None]
-    return np.matmul(invert(np.matmul(weighted, jac.transpose(0, 2, 1))), np.matmul(weighted, target[:, :, None]))[:, :, 0]
+    window = _window(film, fits.position_px, fits.radius_px, sigma_px, noise, others)
+    weight = window.valid / noise.variance_at(window.raw)
+    data = window.raw - window.neighbours
+    images = _images(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, sigma_px, mu_px)
+    theta = weighted_least_squares(images.linear, weight, data)
+    edge = edge_profile(data - images.value.T @ theta[: len(fits.depth)], window.valid, sigma_px)
+    residual, jac = data - images.linear @ theta, columns([images.jacobian(theta).T, edge.T])
+    explained = [(weight * residual) @ part @ weighted_least_squares(part, weight, residual) for part in (jac, jac[:, : -edge.shape[1]])]
+    return float(explained[0] - explained[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,45 +210,43 @@ def _images(window: _Window, surface: Float, local: Float, radius: Float, sigma_
     return _Images(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, pairs, of_pairs)
 
 
-def edge_profiles(bare: Float, valid: Float, sigma_px: float) -> Float:
-    """Return functions that together make any smooth profile across the strongest edge of each window.
+def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
+    """Return functions that together make any smooth profile across the strongest edge of a window.
 
     The edge of a bone or an implant is straight over the width of a ball: it changes across, not along. A ball changes both ways, so its
     centre stays determined, if less well across the edge; the covariance knows.
 
     Parameters
     ----------
-    bare : ndarray of shape (n, s * s)
-        The windows without their balls.
-    valid : ndarray of shape (n, s * s)
+    bare : ndarray of shape (s * s,)
+        The window without its balls.
+    valid : ndarray of shape (s * s,)
         1, or 0 where masked.
     sigma_px : float
         Blur of the film: nothing changes faster.
 
     Returns
     -------
-    ndarray of shape (n, k, s * s)
-        Cubic B-splines of the coordinate across the edge; 0 where a window needs fewer.
+    ndarray of shape (s * s, p)
+        Cubic B-splines of the coordinate across the edge.
     """
-    n, pixels = bare.shape
-    size = math.isqrt(pixels)
-    bare, valid = bare.reshape(n, size, size), valid.reshape(n, size, size)
-    weight = gaussian_filter(valid, (0, 1, 1))
-    smooth = gaussian_filter(bare * valid, (0, 1, 1)) / np.maximum(weight, 1e-6)
-    by = np.stack(np.gradient(smooth, axis=(2, 1)), axis=1)
-    tensor = np.matmul((by * (valid * (weight > 0.9))[:, None]).reshape(n, 2, -1), by.reshape(n, 2, -1).transpose(0, 2, 1))
-    across = np.linalg.eigh(tensor)[1][:, :, 1]
+    size = math.isqrt(len(bare))
+    bare, valid = bare.reshape(size, size), valid.reshape(size, size)
+    weight = gaussian_filter(valid, 1.0)
+    smooth = gaussian_filter(bare * valid, 1.0) / np.maximum(weight, 1e-6)
+    by_row, by_col = np.gradient(smooth)
+    inside = valid * (weight > 0.9)
+    tensor = np.array([[(inside * a * b).sum() for b in (by_col, by_row)] for a in (by_col, by_row)])
+    across = np.linalg.eigh(tensor)[1][:, 1]
     steps = np.arange(size) - (size - 1) / 2
-    t = (steps * across[:, :1, None] + (steps * across[:, 1:])[:, :, None]).reshape(n, -1)
-    first, span = t.min(1, keepdims=True), np.ptp(t, axis=1, keepdims=True)
-    place = (t - first) / np.maximum(KNOTS * sigma_px, span / 14)
+    t = (steps * across[0] + (steps * across[1])[:, None]).ravel()
+    step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
+    place = (t - t.min()) / step
     knot = place.astype(np.intp)
     part = place - knot
     # a spline reaches two knots to either side; those centred off the window are left out
-    splines = np.zeros((n, int(knot.max()) + 4, pixels))
+    splines = np.zeros((int(knot.max()) + 4, len(t)))
     of_four = ((1 - part) ** 3 / 6, 2 / 3 - part**2 + part**3 / 2, 2 / 3 - (1 - part) ** 2 + (1 - part) ** 3 / 2, part**3 / 6)
     for k, basis in enumerate(of_four):
-        splines[np.arange(n)[:, None], knot + k, np.arange(pixels)] = basis
-    needed = np.ceil(place.max(1) - 1e-9).astype(np.intp) + 2
-    splines[np.arange(splines.shape[1]) >= needed[:, None]] = 0.0
-    return splines[:, 1 : needed.max()]
+        splines[knot + k, np.arange(len(t))] = basis
+    return splines[1 : int(np.ceil(place.max() - 1e-9)) + 2].T

@@ -91,6 +91,7 @@ def _most_likely(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
     divided by what the model leaves of it, as if the variance of each were unknown: bone under it and errors of the model are no noise.
     """
     halves = np.ceil(fits.radius_px + 2.5 * optics.sigma_px + 1)
+    fits = fit_at(film, fits.position_px, fits.radius_px, optics, noise, quick=True)
     first = fits
     now = _equations(film, fits, first, halves, optics, noise)
     expected = np.array([[1.0, 0.0], [-1.0, 1.0]]) / _EXPECTED[:, None]

@@ -126,34 +126,31 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
     An edge that a quadratic surface cannot follow pulls the centre. What the edge model moves it by says how much is at stake: half of that
     is added to the stated error, since edges bend and have other profiles than the model's.
     """
-    if len(fits.depth) == 0:
-        return fits
-
-    def neighbours(i: int, cols: Float, rows: Float) -> Float:
-        return _images(fits, np.array([i]), optics, tees, cols, rows)[0]
-
-    white = noise.correlation.sum()
-    foreseen = edge_gain(film, fits, optics, noise, neighbours) / white > _FORESEEN * EDGE_GAIN
-    plain = np.ones(len(fits.depth), bool)
     parts = []
     for g in _groups(fits, optics):
         index = np.array(g)
-        start, radius = fits.position_px[index], fits.radius_px[index]
-        # a size at the limit is not fitted: nothing that comes to rest there is a ball
-        if len(g) > _MOST_IN_GROUP or (radius >= RADIUS_PX[1]).any() or not foreseen[index].any():
-            continue
         beside = _beside(fits, index, optics, tees)
+        plain = fits.rows(index)
+        # a size at the limit is not fitted: nothing that comes to rest there is a ball
+        if len(g) > _MOST_IN_GROUP or (plain.radius_px >= RADIUS_PX[1]).any():
+            parts.append(plain)
+            continue
+        start, radius = plain.position_px, plain.radius_px
+        foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside) / noise.correlation.sum()
+        if foreseen < _FORESEEN * EDGE_GAIN:
+            parts.append(plain)
+            continue
         flat = fit_group(film, start, radius, optics.sigma_px, optics.mu_px, noise, beside)
         edged = fit_group(film, start, radius, optics.sigma_px, optics.mu_px, noise, beside, edge=True)
-        gain = 2 * (edged.log_likelihood[0] - flat.log_likelihood[0]) / white
+        gain = 2 * (edged.log_likelihood[0] - flat.log_likelihood[0]) / noise.correlation.sum()
         if gain < EDGE_GAIN or not edged.converged.all():
+            parts.append(plain)
             continue
-        shift = edged.position_px - start
+        shift = edged.position_px - plain.position_px
         covariance = edged.covariance.copy()
         covariance[:, :2, :2] += 0.25 * shift[:, :, None] * shift[:, None, :]
         parts.append(replace(edged, covariance=covariance))
-        plain[index] = False
-    return join([fits.rows(plain), *parts])
+    return join(parts) if parts else fits
 
 
 def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
