@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from rsa_vision.detect.ball_equations import invert, pixels_of, polynomial, weighted
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import Patches
 from rsa_vision.detect.profiles import BallTable, Optics, ball_table
@@ -21,7 +21,6 @@ _LARGE_PX = 27  # side of a window of which a first look does not need every pix
 _CONVERGED_PX = 2e-4
 _NEAR_PX = 5e-3  # enough for a first look
 _MAX_STEP_PX = 0.7
-_RIDGE = 1e-10  # relative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,12 +90,6 @@ def half_size(radius_px: float, sigma_px: float) -> int:
     return int(np.ceil(1.9 * radius_px + 3.0 * sigma_px + 2.0))
 
 
-def polynomial(axis_scale: float, dx: Float, dy: Float) -> Float:
-    """Return the six monomials of a quadratic surface on a new last axis, scaled to about one at the rim of the window."""
-    u, v = dx / axis_scale, dy / axis_scale
-    return np.moveaxis(np.array([np.ones_like(u), u, v, u * u, u * v, v * v]), 0, -1)  # each in one piece in memory
-
-
 def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, sigma_px: float, mu_px: float) -> Float:
     """Return the blurred opacity (0..1) of balls at these distances from their centres.
 
@@ -158,7 +151,7 @@ def fit_balls(
     n, size = len(start_px), patches.size
     half = size // 2
     table = ball_table(round(mu_px * sigma_px, 3))
-    pixels = _pixels(size, stride)
+    pixels = pixels_of(size, stride)
     values = patches.values.reshape(n, -1)
     level = values.mean(1)[:, None]
     beside = level if extra is None else level + extra.reshape(n, -1)[:, pixels.place]
@@ -179,14 +172,14 @@ def fit_balls(
         value, *by = slopes(table, dx, dy, radius[of], sigma_px)
         return np.stack([*by, value], axis=1)
 
-    equations = _Equations(pixels.surface, data, valid / noise.variance_at(level).astype(np.float32))
+    equations = weighted(pixels, data, valid / noise.variance_at(level).astype(np.float32))
     busy: Any = slice(None)
     reweighted = _REWEIGHTED[:1] if quick else _REWEIGHTED
     for step in range(_QUICK_STEPS if quick else _STEPS):
         seen = images(busy)
         if step in reweighted:  # the variance follows the expected value once the model is near
             model = equations.model(seen, depth) + beside
-            equations = _Equations(pixels.surface, data, valid / noise.variance_at(model).astype(np.float32))
+            equations = weighted(pixels, data, valid / noise.variance_at(model).astype(np.float32))
         normal, right, _ = equations.normal(seen, busy, damping=1e-6)
         if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
             depth = right[:, 3] / normal[:, 3, 3]
@@ -215,7 +208,7 @@ def fit_balls(
     square = weight * residual**2
     counted = (core * valid[:, :reached]).sum(1)
     core_n = np.maximum(counted, 1.0)
-    left, total = ((v).sum(1, dtype=np.float64) for v in (square[:, :reached] * core, square))
+    left, total = (s.sum(1, dtype=np.float64) for s in (square[:, :reached] * core, square))
     raised = weight[:, :reached] * (residual[:, :reached] + depth[:, None].astype(np.float32) * seen[:, 3]) ** 2 * core
     chi2_ring = chi2_uneven = (total - left) / np.maximum(valid.sum(1) - counted - 10, 1.0)
     if not quick:
@@ -244,13 +237,6 @@ def fit_balls(
         n_core=core_n,
         converged=converged,
     )
-
-
-def invert(normal: Float) -> Float:
-    """Return the inverses of normal matrices (n, p, p); what they do not determine has a variance that is large, not infinite."""
-    scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
-    both = scale[:, :, None] * scale[:, None, :]
-    return np.asarray(np.linalg.inv(normal / both + _RIDGE * np.eye(normal.shape[1])) / both)
 
 
 def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) -> Float:
@@ -322,85 +308,6 @@ def derivatives(radius: Float, half: int, sigma_px: float, mu_px: float) -> Floa
     value, *by = slopes(ball_table(round(mu_px * sigma_px, 3)), cols, rows, radius, sigma_px)
     surface = polynomial(half, cols[0], rows[0]).T
     return np.concatenate([np.stack([*by, value], axis=1), np.broadcast_to(surface, (len(radius), *surface.shape))], axis=1)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pixels:
-    """Pixels of a window that are looked at, in the order of their distance from its middle: a ball reaches only the first of them.
-
-    Attributes
-    ----------
-    place, back : ndarray of int, shape (p,)
-        Where they lie in the window, and where its pixels are among them (of windows of which all are looked at).
-    cols, rows : ndarray of shape (p,)
-    distance, side : ndarray of shape (p,)
-        From the middle, and the larger one of that along rows and columns.
-    surface : ndarray of shape (p, 6)
-        The background's monomials.
-    """
-
-    place: Int
-    back: Int
-    cols: Float
-    rows: Float
-    distance: Float
-    side: Int
-    surface: Float
-
-
-@lru_cache(maxsize=64)
-def _pixels(size: int, stride: int) -> _Pixels:
-    half = size // 2
-    axis = np.arange(half % stride, size, stride)
-    cols, rows = (g.ravel() for g in np.meshgrid(axis, axis))
-    distance = np.hypot(cols - half, rows - half)
-    order = np.argsort(distance, kind="stable")
-    cols, rows = cols[order], rows[order]
-    single = (axis.astype(np.float32) for axis in (cols, rows))
-    dx, dy = cols - half, rows - half
-    return _Pixels(rows * size + cols, np.argsort(order), *single, distance[order], np.maximum(abs(dx), abs(dy)), polynomial(half, dx, dy))
-
-
-class _Equations:
-    """Least squares for balls of depth one in windows, the background's coefficients eliminated.
-
-    Parameters
-    ----------
-    surface : ndarray of shape (p, 6)
-    data, weight : ndarray of shape (n, p)
-    """
-
-    def __init__(self, surface: Float, data: Float, weight: Float) -> None:
-        self.surface, self.data, self.weight = surface, data, weight
-        squares = (surface[:, :, None] * surface[:, None]).reshape(len(surface), -1)
-        self.inverse = invert((weight @ squares).reshape(len(data), *[surface.shape[1]] * 2))
-        self.right = (weight * data) @ surface
-
-    def normal(self, images: Float, of: Any, damping: float = _RIDGE) -> tuple[Float, Float, Float]:
-        """Return normal matrices (n, 4, 4) and right sides (n, 4) of some windows, and what backgrounds take of the images (n, 4, 6)."""
-        # added up in double precision: radius and depth of a ball that is small against the blur can all but stand for each other
-        n, _, reached = images.shape
-        images = images.astype(np.float64)
-        weighted = images * self.weight[of, None, :reached]
-        mixed = (weighted.reshape(4 * n, -1) @ self.surface[:reached]).reshape(n, 4, -1)
-        taken = np.matmul(mixed, self.inverse[of])
-        own = np.matmul(weighted, images.transpose(0, 2, 1))
-        own[:, *np.diag_indices(4)] = np.maximum(own[:, *np.diag_indices(4)] * (1 + damping), 1e-30)
-        normal = own - np.matmul(taken, mixed.transpose(0, 2, 1))
-        right = np.matmul(weighted, self.data[of, :reached, None]) - np.matmul(taken, self.right[of, :, None])
-        return normal, right[:, :, 0], taken
-
-    def background(self, images: Float, depth: Float) -> Float:
-        """Return the background's coefficients for balls of these depths, shape (n, 6)."""
-        reached = images.shape[2]
-        of_balls = (self.weight[:, :reached] * images[:, 3] * depth[:, None]) @ self.surface[:reached]
-        return np.matmul(self.inverse, (self.right - of_balls)[:, :, None])[:, :, 0]
-
-    def model(self, images: Float, depth: Float) -> Float:
-        """Return what is expected in every pixel, shape (n, p)."""
-        out = (self.background(images, depth) @ self.surface.T).astype(np.float32)
-        out[:, : images.shape[2]] += depth[:, None].astype(np.float32) * images[:, 3]
-        return out
 
 
 def _by_depth(depth: Float) -> Float:

@@ -69,11 +69,8 @@ def fit_at(
         patches = cut(film, position_px[index], int(halves[index[-1]]), noise)
         extra = None
         if others is not None:
-            grid = np.arange(patches.size)
-            near = [
-                others(i, *np.meshgrid(grid + corner[0], grid + corner[1]))
-                for i, corner in zip(index, patches.corner_px.astype(np.float64), strict=True)
-            ]
+            cols, rows = np.meshgrid(*[np.arange(float(patches.size))] * 2)
+            near = [others(i, cols + corner[0], rows + corner[1]) for i, corner in zip(index, patches.corner_px, strict=True)]
             extra = np.stack([image for image, _ in near])
             patches = replace(patches, valid=patches.valid & ~np.stack([doubtful for _, doubtful in near]))
         start = (position_px[index], radius_px[index], halves[index])

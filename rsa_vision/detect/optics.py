@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits, ball_image, invert, polynomial, slopes
+from rsa_vision.detect.ball_equations import invert, polynomial
+from rsa_vision.detect.balls import BallFits, ball_image, slopes
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, fit_at, misfit, refine
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut

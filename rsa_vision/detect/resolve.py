@@ -228,11 +228,11 @@ def beside_balls(known: BallFits, optics: Optics, tees: Background | None, cols:
 
 
 def _images(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
-    """Images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
+    """Images of the tees and of all balls but ``members`` at the pixels of a window, and the pixels well under one of those balls."""
     total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
     doubtful: Bool = np.zeros(cols.shape, np.bool_)
     reach = known.radius_px + 4 * optics.sigma_px
-    low, high = np.array([cols.min(), rows.min()]), np.array([cols.max(), rows.max()])
+    low, high = (np.array([cols.flat[k], rows.flat[k]]) for k in (0, -1))
     near = np.array(((known.position_px > low - reach[:, None]) & (known.position_px < high + reach[:, None])).all(1))
     near[members] = False
     for j in np.nonzero(near)[0]:

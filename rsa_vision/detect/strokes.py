@@ -43,8 +43,13 @@ def find_strokes(answer: NDArray[Any], place: Int, strength: Float, level: int) 
     """
     r, c = np.divmod(place, answer.shape[1])
     weight = answer.ravel()[place].astype(np.float64)
-    found = [_one_polarity(r[mine], c[mine], sign * weight[mine], sign * strength[mine], level, sign) for sign in (1, -1) for mine in (sign * strength > 0,)]
-    return np.concatenate(found)
+    dark = strength > 0
+    return np.concatenate(
+        [
+            _one_polarity(r[mine], c[mine], np.abs(weight[mine]), np.abs(strength[mine]), level, sign)
+            for sign, mine in ((1, dark), (-1, ~dark))
+        ]
+    )
 
 
 def _one_polarity(r: Int, c: Int, weight: Float, over: Float, level: int, sign: int) -> Float:

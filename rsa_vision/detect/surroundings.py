@@ -64,7 +64,8 @@ def variance_of_surroundings(
         whole = patches.valid.all(axis=(1, 2))
         ball, where, values = ball[whole], where[whole], patches.values[whole].reshape(-1, (2 * int(half) + 1) ** 2)
         by_film, covariance = _estimator(balls.rows(index), int(half), optics, noise)
-        error = np.einsum("kip,kp->ki", by_film[ball], values - values.mean(axis=1, keepdims=True))
+        places = np.split(values - values.mean(axis=1, keepdims=True), np.searchsorted(ball, np.arange(1, len(index))))
+        error = np.concatenate([at @ one.T for at, one in zip(places, by_film, strict=True)])
         square = np.einsum("ki,ki->k", error, np.linalg.solve(covariance[ball], error[:, :, None])[:, :, 0])
         ratio[index[ball], where] = square / noise.variance_at(values.mean(axis=1)) / _MEDIAN
     counted = np.isfinite(ratio).sum(axis=1)
