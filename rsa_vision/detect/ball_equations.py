@@ -101,8 +101,9 @@ class Equations:
         mixed = (weighted.reshape(4 * n, -1) @ self.surface[:reached]).reshape(n, 4, -1)
         taken = np.matmul(mixed, self.inverse[of])
         own = np.matmul(weighted, images.transpose(0, 2, 1))
-        own[:, *np.diag_indices(4)] = np.maximum(own[:, *np.diag_indices(4)] * (1 + damping), 1e-30)
         normal = own - np.matmul(taken, mixed.transpose(0, 2, 1))
+        each = np.arange(4)  # what the background can stand for has a variance that is large, not infinite
+        normal[:, each, each] = np.maximum(normal[:, each, each], 0.0) + damping * np.maximum(own[:, each, each], 1e-30)
         right = np.matmul(weighted, self.data[of, :reached, None]) - np.matmul(taken, self.right[of, :, None])
         return normal, right[:, :, 0], taken
 

@@ -205,6 +205,7 @@ def fit_balls(
     covariance = whole / by[:, None]
     variance = 1 / normal[:, 3, 3] / stride**2
     core = _distance(pixels.cols[:reached] - local[:, :1], pixels.rows[:reached] - local[:, 1:]) < (radius + sigma_px)[:, None]
+    core &= own[:, :reached]
     square = weight * residual**2
     counted = (core * valid[:, :reached]).sum(1)
     core_n = np.maximum(counted, 1.0)
