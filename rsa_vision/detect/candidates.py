@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from rsa_vision.detect.junctions import find_junctions
 from rsa_vision.detect.noise import NoiseModel, medians
 from rsa_vision.detect.strokes import COLUMNS, find_strokes
-from rsa_vision.types import Float
+from rsa_vision.types import Float, Int
 
 BAND = 1024  # rows at full resolution that are in memory as float32 at once
 MARGIN = 128  # overlap of bands; more than the reach of the coarsest filter
 BLOCK = 32  # side of the blocks of one pyramid level over which the spread is measured
 # (pyramid level, inner sigma, outer sigma in pixels of that level, radius in film pixels that answers best)
 SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
+REACH = 4.0  # blur widths to which kernels go
 FAINT = 0.86  # of what counts as significant: extrema of so much are listed too, for looks that know what they look for
 ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
 JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for
@@ -99,42 +100,51 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
     pad = (-band.shape[0] % 8, -band.shape[1] % 8)
     if any(pad):
         band = cv2.copyMakeBorder(band, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
-    level_images: dict[int, NDArray[Any]] = {}
     image: NDArray[Any] = cv2.resize(band, (band.shape[1] // 2, band.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
-    for level in (1, 2, 3):
-        level_images[level] = image
-        image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    at, blurred = (1, 0.0), image
     out = [np.zeros((0, 5))]
     junctions, strokes = np.zeros((0, 5)), [np.zeros((0, COLUMNS))]
-    last: tuple[tuple[int, float], NDArray[Any]] | None = None
     for level, inner, outer, radius in SCALES:
-        source = level_images[level]
+        if level > at[0]:
+            image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+            at, blurred = (level, 0.0), image
         # outer minus inner: positive where the mark is darker than its surroundings
-        begun = last[1] if last and last[0] == (level, inner) else cv2.GaussianBlur(source, (0, 0), inner)
-        last = (level, outer), cv2.GaussianBlur(source, (0, 0), outer)  # the next scale may begin with it
-        answer = cv2.subtract(last[1], begun, dst=begun)
-        limit = threshold * cv2.resize(
-            _local_spread(answer, _white_spread(noise, level, inner, outer)),
-            (answer.shape[1], answer.shape[0]),
-            interpolation=cv2.INTER_LINEAR,
-        )
-        out.append(_extrema(answer, FAINT * limit, level, radius, FAINT * threshold))
+        begun = _blurred(blurred, at[1], inner)
+        blurred = _blurred(begun, inner, outer)  # the next scale may begin with it
+        at = (level, outer)
+        answer = cv2.subtract(blurred, begun, dst=begun)
+        spread = _local_spread(answer, _white_spread(noise, level, inner, outer))
+        limit = cv2.resize(threshold * spread, (answer.shape[1], answer.shape[0]), interpolation=cv2.INTER_LINEAR)
+        significance = cv2.divide(answer, limit, dst=limit)
+        place = np.flatnonzero((significance > FAINT) | (significance < -FAINT))
+        strength = np.asarray(significance.ravel()[place], np.float64)
+        out.append(_extrema(answer, place, threshold * strength, level, radius))
         if (level, radius) == JUNCTION_SCALE:
-            junctions = find_junctions(answer, limit, level)
+            junctions = find_junctions(significance, level)
         if (level, radius) in STROKE_SCALES:
-            strokes.append(find_strokes(answer, limit, level))
+            clear = np.abs(strength) > 1
+            strokes.append(find_strokes(answer, place[clear], strength[clear], level))
     return np.concatenate(out), junctions, np.concatenate(strokes)
 
 
-def _extrema(answer: NDArray[Any], limit: NDArray[Any], level: int, radius: float, threshold: float) -> Float:
-    row, col = np.divmod(np.flatnonzero((answer > limit) | (answer < -limit)), answer.shape[1])
+def _blurred(image: NDArray[Any], by: float, sigma: float) -> NDArray[Any]:
+    """Blur further what is blurred: shorter kernels than from the start."""
+    more = float(np.sqrt(sigma**2 - by**2))
+    if more == 0:
+        return image
+    side = 2 * round(REACH * more) + 1
+    return cv2.GaussianBlur(image, (side, side), more)
+
+
+def _extrema(answer: NDArray[Any], place: Int, strength: Float, level: int, radius: float) -> Float:
+    row, col = np.divmod(place, answer.shape[1])
     whole = (row > 0) & (row < answer.shape[0] - 1) & (col > 0) & (col < answer.shape[1] - 1)
-    row, col = row[whole], col[whole]
+    row, col, strength = row[whole], col[whole], strength[whole]
     # few pixels answer: to look around those costs less than filters of rank over all
     for dr, dc in ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)):
         here = answer[row, col]
         peak = np.copysign(1, here) * (here - answer[row + dr, col + dc]) >= 0
-        row, col = row[peak], col[peak]
+        row, col, strength = row[peak], col[peak], strength[peak]
     if len(row) == 0:
         return np.zeros((0, 5))
     centre = answer[row, col].astype(np.float64)
@@ -148,7 +158,6 @@ def _extrema(answer: NDArray[Any], limit: NDArray[Any], level: int, radius: floa
     size = 2**level
     position_c = (col + shift_c + 0.5) * size - 0.5
     position_r = (row + shift_r + 0.5) * size - 0.5
-    strength = centre * threshold / np.maximum(limit[row, col], 1e-9)
     return np.stack([position_c, position_r, np.full(len(row), radius), strength, roundness], axis=1)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import polynomial
+from rsa_vision.detect.ball_equations import polynomial
 from rsa_vision.detect.needle_images import Images, NeedleFit, NeedleShape, arm_images, needle_image, support
 from rsa_vision.detect.needles import core_pixels, scored
 from rsa_vision.detect.noise import NoiseModel, influence_covariance

@@ -16,6 +16,8 @@ from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
+_BATCH = 48  # windows that stay in the cache
+_LIKE = 1.25  # ratio of their sizes
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
@@ -57,24 +59,23 @@ def fit_at(
         In the order of the positions.
     """
     halves = np.array([half_size(r, optics.sigma_px) for r in radius_px])
-    order, parts = [], []
-    for half in np.unique(halves):
-        index = np.nonzero(halves == half)[0]
-        patches = cut(film, position_px[index], int(half), noise)
+    order, parts = np.argsort(halves, kind="stable"), []
+    begin = 0
+    while begin < len(order):
+        # windows of nearly one size at once; what of them is not a smaller one's is masked
+        index = order[begin : begin + _BATCH]
+        index = index[halves[index] <= _LIKE * halves[index[0]]]
+        begin += len(index)
+        patches = cut(film, position_px[index], int(halves[index[-1]]), noise)
         extra = None
         if others is not None:
-            grid = np.arange(patches.size)
-            near = [
-                others(i, *np.meshgrid(grid + corner[0], grid + corner[1]))
-                for i, corner in zip(index, patches.corner_px.astype(np.float64), strict=True)
-            ]
+            cols, rows = np.meshgrid(*[np.arange(float(patches.size))] * 2)
+            near = [others(i, cols + corner[0], rows + corner[1]) for i, corner in zip(index, patches.corner_px, strict=True)]
             extra = np.stack([image for image, _ in near])
             patches = replace(patches, valid=patches.valid & ~np.stack([doubtful for _, doubtful in near]))
-        start = (position_px[index], radius_px[index])
-        parts.append(fit_balls(patches, *start, optics.sigma_px, optics.mu_px, noise, extra, quick=quick, sparse=sparse))
-        order.append(index)
-    fits = join(parts)
-    return fits.rows(np.argsort(np.concatenate(order)))
+        start = (position_px[index], radius_px[index], halves[index])
+        parts.append(fit_balls(patches, *start, optics, noise, extra, quick=quick, sparse=sparse))
+    return join(parts).rows(np.argsort(order))
 
 
 def misfit(fits: BallFits, noise: NoiseModel, chance: float = 0.0) -> Float:

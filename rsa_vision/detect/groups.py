@@ -6,11 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, invert, polynomial, uneven
+from rsa_vision.detect.ball_equations import invert, polynomial
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, uneven
 from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
@@ -232,11 +233,12 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
     """
     size = math.isqrt(len(bare))
     bare, valid = bare.reshape(size, size), valid.reshape(size, size)
-    weight = gaussian_filter(valid, 1.0)
-    smooth = gaussian_filter(bare * valid, 1.0) / np.maximum(weight, 1e-6)
+    weight, smooth = (cv2.GaussianBlur(image, (9, 9), 1.0, borderType=cv2.BORDER_REFLECT) for image in (valid, bare * valid))
+    smooth = smooth / np.maximum(weight, 1e-6)
     by_row, by_col = np.gradient(smooth)
     inside = valid * (weight > 0.9)
-    tensor = np.array([[(inside * a * b).sum() for b in (by_col, by_row)] for a in (by_col, by_row)])
+    by = np.stack([by_col, by_row]).reshape(2, -1)
+    tensor = (by * inside.ravel()) @ by.T
     across = np.linalg.eigh(tensor)[1][:, 1]
     steps = np.arange(size) - (size - 1) / 2
     t = (steps * across[0] + (steps * across[1])[:, None]).ravel()

@@ -23,27 +23,25 @@ _APART = 4  # pixels of the answer; of junctions nearer than this, the best
 _GAP = 0.5  # between the arms the answer may reach this part of the weakest arm
 
 
-def find_junctions(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Float:
+def find_junctions(answer: NDArray[Any], level: int) -> Float:
     """Find points with three arms in the shape of a T.
 
     Parameters
     ----------
     answer : ndarray of shape (rows, cols)
-        Filter answer of one pyramid level; positive for dark marks.
-    limit : ndarray of the same shape
-        Answer that counts as significant.
+        Filter answer of one pyramid level in units of what counts as significant; positive for dark marks.
     level : int
         Pyramid level.
 
     Returns
     -------
     ndarray of shape (n, 5)
-        col_px, row_px, angle of the stem (radians, counter-clockwise as displayed), ring radius in film pixels, strength (score in units of
-        ``limit``); negative strength for bright marks.
+        col_px, row_px, angle of the stem (radians, counter-clockwise as displayed), ring radius in film pixels, strength (score); negative
+        strength for bright marks.
     """
     margin = int(RINGS_PX[-1] / 2**level) + 1
-    scaled = cv2.copyMakeBorder(cv2.divide(answer, limit), margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-    found = [_one_polarity(scaled, sign, margin, level) for sign in (1, -1)]
+    around = cv2.copyMakeBorder(answer, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+    found = [_one_polarity(around, sign, margin, level) for sign in (1, -1)]
     return np.concatenate(found)
 
 
@@ -54,7 +52,7 @@ def _one_polarity(scaled: NDArray[Any], sign: int, margin: int, level: int) -> F
     if not strong.any():
         return np.zeros((0, 5))
     # the tips fade out, so the centre itself may answer weakly: look a little around what answers
-    row, col = np.divmod(np.flatnonzero(cv2.dilate(strong, np.ones((5, 5), np.uint8)) > 0), strong.shape[1])
+    row, col = np.divmod(np.flatnonzero(cv2.dilate(strong, np.ones((5, 5), np.uint8)).view(bool)), strong.shape[1])
     theta = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     quarter, eighth = DIRECTIONS // 4, DIRECTIONS // 8
     best, angle, ring = np.zeros((3, len(row)), np.float32)

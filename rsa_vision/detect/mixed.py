@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect.balls import BallFits, ball_image, polynomial
+from rsa_vision.detect.ball_equations import polynomial
+from rsa_vision.detect.balls import BallFits, ball_image
 from rsa_vision.detect.crossing import fit_crossing
 from rsa_vision.detect.find import plausible
 from rsa_vision.detect.groups import fit_group

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import polynomial
+from rsa_vision.detect.ball_equations import polynomial
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape, arm_images, support
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares

@@ -19,6 +19,7 @@ MARKS = 1.8  # times as much as that, and it is not even noise and texture
 STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, and with this power of the value
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
+_MOST_LOOKED_AT = 1500**2  # pixels that tell whether a film is saturated
 _LEVELS = 12  # value classes of the variance curve
 _QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
@@ -84,7 +85,7 @@ def saturation(film: NDArray[Any], bits: int) -> tuple[float, float]:
     floor, ceiling : float
         Pixels must lie strictly between; infinite where nothing is saturated.
     """
-    sample = film[:: max(1, film.shape[0] // 1500), :: max(1, film.shape[1] // 1500)].copy()  # gathered once: every look at it is fast then
+    sample = film[:: max(1, film.size // _MOST_LOOKED_AT)]  # whole rows, as they lie in memory
     low, high = int(sample.min()), int(sample.max())
     crowd = max(20, sample.size // 20000)
     full = 2**bits - 1

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits, ball_image, invert, polynomial, slopes
+from rsa_vision.detect.ball_equations import invert, polynomial
+from rsa_vision.detect.balls import BallFits, ball_image, slopes
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, fit_at, misfit, refine
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
@@ -74,12 +75,14 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     position, radius = position[chosen], radius[chosen]
     sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen)) for t in trials])
     # what came close at another blur only, as two balls in one at a wide one, is none of the film's balls
-    close = _closeness(fit(sigma, KAPPA), noise)
+    fits = fit(sigma, KAPPA)
+    close = _closeness(fits, noise)
     kept = close < max(_CLOSE, _UNLIKE * float(np.sort(close)[len(close) // 4]))
     if not kept.all():
-        chosen, position, radius = chosen[kept], position[kept], radius[kept]
-        sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen)) for t in trials])
-    return _most_likely(film, fit(sigma, KAPPA), Optics(sigma, KAPPA / sigma), noise)
+        position, radius = position[kept], radius[kept]
+        sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen[kept])) for t in trials])
+        fits = fit(sigma, KAPPA)
+    return _most_likely(film, fits, Optics(sigma, KAPPA / sigma), noise)
 
 
 def _most_likely(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel) -> tuple[Optics, float]:

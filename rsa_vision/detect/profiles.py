@@ -54,7 +54,7 @@ class BallTable:
 
     Attributes
     ----------
-    nodes : ndarray of shape (3, ny, nx)
+    nodes : ndarray of shape (3, ny, nx), single precision
         Opacity (0..1), and its derivatives by rho/sigma and by r/sigma.
     """
 
@@ -78,16 +78,18 @@ class BallTable:
         kind = x.dtype
         row = np.clip((np.log(y) - np.log(_Y_MIN)) / _Y_STEP, 0, ny - 1.001)
         top = row.astype(np.intp)
-        frac = (row - top)[:, None]
+        frac = (row - top).astype(self.nodes.dtype)[:, None]
         # one blended row for every ball, then a look-up along rho only: half the work of a two-dimensional look-up for each pixel
         col = np.minimum(x * kind.type(1 / _X_STEP), kind.type(nx - 1.001))
         left = col.astype(np.intp)
         part = col - left.astype(kind)
         reach = int(left.max(initial=0)) + 2
-        line = (self.nodes[:, top, :reach] * (1 - frac) + self.nodes[:, top + 1, :reach] * frac).reshape(3, -1).astype(kind)
+        low, high = self.nodes[:, top, :reach], self.nodes[:, top + 1, :reach]
+        line = (low + frac * (high - low)).reshape(3, -1)
+        rise = np.empty_like(line)
+        np.subtract(line[:, 1:], line[:, :-1], out=rise[:, :-1])
         index = left + (np.arange(len(y)) * reach).reshape((-1,) + (1,) * (x.ndim - 1))
-        low = line.take(index, axis=1)
-        value, d_rho, d_radius = low + part * (line.take(index + 1, axis=1) - low)
+        value, d_rho, d_radius = line.take(index, axis=1) + part * rise.take(index, axis=1)
         return value, d_rho, d_radius
 
 
@@ -109,7 +111,7 @@ def ball_table(mu_sigma: float) -> BallTable:
     coarse = np.matmul(blur.kernel, (opacity * blur.weight)[:, :, None])[:, :, 0]
     of_y, by_y = blur.along_y
     of_x, by_x = blur.along_x
-    return BallTable(np.array([of_y @ coarse @ of_x.T, of_y @ coarse @ by_x.T, by_y @ coarse @ of_x.T]))
+    return BallTable(np.array([of_y @ coarse @ of_x.T, of_y @ coarse @ by_x.T, by_y @ coarse @ of_x.T], np.float32))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -231,7 +231,7 @@ def images_beside(known: BallFits, members: Int, optics: Optics, tees: Backgroun
     total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
     doubtful: Bool = np.zeros(cols.shape, np.bool_)
     reach = known.radius_px + 4 * optics.sigma_px
-    low, high = np.array([cols.min(), rows.min()]), np.array([cols.max(), rows.max()])
+    low, high = (np.array([cols.flat[k], rows.flat[k]]) for k in (0, -1))
     near = np.array(((known.position_px > low - reach[:, None]) & (known.position_px < high + reach[:, None])).all(1))
     near[members] = False
     for j in np.nonzero(near)[0]:

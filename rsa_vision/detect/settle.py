@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.alike import true_spread
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, invert, polynomial, slopes, uneven
+from rsa_vision.detect.ball_equations import invert, polynomial
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, slopes, uneven
 from rsa_vision.detect.decide import EDGE
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import Patches, cut
@@ -184,7 +185,8 @@ def _fit(
     precision[:, 2] = held
     precision[:, _PER_BALL:] = _precision(known, structure, at_ease)
     for step in range(_STEPS):
-        value, *by = slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, optics.sigma_px)
+        shapes = slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, optics.sigma_px)
+        value, *by = (shape.astype(np.float64) for shape in shapes)
         images = np.stack([-depth[:, None] * by[0], -depth[:, None] * by[1], depth[:, None] * by[2], value], axis=1)
         left = data - depth[:, None] * value
         # a mark takes away its part of what is there: on linear films more where there is more

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rsa_vision.types import Float
+from rsa_vision.types import Float, Int
 
 LEAST_PEAK = 2.0  # of an island, in units of what counts as significant
 SLIM = 1.5  # ratio of an island's length to its width
@@ -21,15 +21,17 @@ COLUMNS = 6
 _LEAST_AREA = 4  # pixels of the answer
 
 
-def find_strokes(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Float:
+def find_strokes(answer: NDArray[Any], place: Int, strength: Float, level: int) -> Float:
     """Find elongated islands.
 
     Parameters
     ----------
     answer : ndarray of shape (rows, cols)
         Filter answer of one pyramid level; positive for dark marks.
-    limit : ndarray of the same shape
-        Answer that counts as significant.
+    place : ndarray of int, shape (k,)
+        Where it is significant, in the order of the film.
+    strength : ndarray of shape (k,)
+        Answer there in units of what counts as significant.
     level : int
         Pyramid level.
 
@@ -37,22 +39,26 @@ def find_strokes(answer: NDArray[Any], limit: NDArray[Any], level: int) -> Float
     -------
     ndarray of shape (n, 6)
         col_px, row_px of the middle, angle of the axis (radians, counter-clockwise as displayed), length and width in film pixels, strength
-        (largest answer in units of ``limit``); negative strength for bright marks.
+        (the largest of an island); negative strength for bright marks.
     """
-    found = [_one_polarity(answer, limit, level, sign) for sign in (1, -1)]
-    return np.concatenate(found)
-
-
-def _one_polarity(answer: NDArray[Any], limit: NDArray[Any], level: int, sign: int) -> Float:
-    size = 2**level
-    place = np.flatnonzero(answer > limit if sign > 0 else answer < -limit)
-    if len(place) == 0:
-        return np.zeros((0, COLUMNS))
     r, c = np.divmod(place, answer.shape[1])
+    weight = answer.ravel()[place].astype(np.float64)
+    dark = strength > 0
+    return np.concatenate(
+        [
+            _one_polarity(r[mine], c[mine], np.abs(weight[mine]), np.abs(strength[mine]), level, sign)
+            for sign, mine in ((1, dark), (-1, ~dark))
+        ]
+    )
+
+
+def _one_polarity(r: Int, c: Int, weight: Float, over: Float, level: int, sign: int) -> Float:
+    size = 2**level
+    if len(r) == 0:
+        return np.zeros((0, COLUMNS))
     island = _islands(r, c)
-    weight = sign * answer.ravel()[place].astype(np.float64)
     strength = np.zeros(island.max() + 1)
-    np.maximum.at(strength, island, weight / limit.ravel()[place])
+    np.maximum.at(strength, island, over)
     wanted = (strength > LEAST_PEAK) & (np.bincount(island) >= _LEAST_AREA)
     if not wanted.any():
         return np.zeros((0, COLUMNS))
