@@ -91,7 +91,7 @@ def settle(
     around = texture(places, len(free), noise)
     structure = np.where(free[:, None], around.structure, 0.0)
     alone = free & ~edged & (balls.chi2_ring < EDGE)
-    usual = _Usual(*_size(balls.rows(alone)), _proportion(balls, alone, mean_beside(places, len(free))), around.differ)
+    usual = _Usual(*_size(balls.rows(alone)), *_proportion(balls, alone, mean_beside(places, len(free))), around.differ)
     out, ratios = replace(balls, covariance=under * balls.covariance), []
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
@@ -112,6 +112,7 @@ class _Usual:
     log_radius: float
     spread: float  # of that
     proportion: float  # by which depth goes with the background
+    proportion_sd: float
     differ: float  # of structure from window to window: standard deviation of its logarithm
 
     @property
@@ -129,15 +130,15 @@ def _size(alone: BallFits) -> tuple[float, float]:
     return centre, min(spread, _ANYTHING)
 
 
-def _proportion(balls: BallFits, alone: Bool, beside: Float) -> float:
-    """Tell how the depth goes with the background: not at all on logarithmic films, like it on linear ones.
+def _proportion(balls: BallFits, alone: Bool, beside: Float) -> tuple[float, float]:
+    """Tell how the depth goes with the background: not at all on logarithmic films, like it on linear ones; with the error of that.
 
     The fits' own backgrounds have errors that are those of the depths with the other sign. Values farther off have not, and go with the
     backgrounds all the same: they are the instrument of the regression (Wright, 1928), by their ranks.
     """
     use = alone & np.isfinite(beside)
     if np.count_nonzero(use) < _LEAST_BALLS:
-        return 0.0
+        return 0.0, 0.0
     depth, background, rank = (
         balls.depth[use],
         balls.background[use],
@@ -147,13 +148,14 @@ def _proportion(balls: BallFits, alone: Bool, beside: Float) -> float:
     far = _OUTLIER * _SD_OF_MAD * np.median(np.abs(depth - middle))
     depth = np.clip(depth, middle - far, middle + far)
     shared = rank @ background
+    of_linear = middle / np.median(background)
     if shared <= 0:
-        return 0.0
+        return 0.0, abs(of_linear)
     slope = (rank @ depth) / shared
     left = depth - depth.mean() - slope * (background - background.mean())
     error = np.sqrt(left @ left / (len(left) - 2) * (rank @ rank)) / shared
-    of_linear = middle / np.median(background)
-    return float(slope / (1 + (error / of_linear) ** 2))
+    drawn = 1 + (error / of_linear) ** 2
+    return float(slope / drawn), float(error / np.sqrt(drawn))
 
 
 def _fit(
@@ -218,6 +220,9 @@ def _fit(
     )
     # what holding the radius at the usual one does where it is not
     covariance[:, :2, :2] += _by(inverse[:, :2, 2:3] * held[:, None, None], np.full((n, 1), usual.radius_sd_px**2))
+    # and what a wrong proportion does
+    ground = value * (theta[:, 1:] @ surface[:, 1:].T)
+    covariance[:, :2, :2] += _by(np.matmul(estimator, ground[:, :, None]), np.full((n, 1), usual.proportion_sd**2))
     residual = left - np.matmul(change[:, None], everything)[:, 0]
     core = np.hypot(cols - local[:, :1], rows - local[:, 1:]) < (radius + optics.sigma_px)[:, None]
     rest = [uneven(residual, weight, local, side, where) for where in (core, ~core)]
