@@ -26,6 +26,7 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import images_beside, resolve_balls
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
+from rsa_vision.detect.surroundings import free_places
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
@@ -33,8 +34,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 __all__ = ["Detection", "detect_markers"]
 
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
-_ENOUGH_BALLS = 8  # that tell the noise under them
-_MOST_UNDER = 0.4, 2.5  # what they may tell
+WHOLE = 0.999  # part of the pixels under a ball
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
@@ -200,8 +200,10 @@ def _one_polarity(
     others = tees + pins
     place = np.array([t.position_px for t in others]).reshape(-1, 2)
     reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
-    under = _variance_under(balls, touching, optics, noise)
-    balls, ratio = settle(film, balls, under, ~touching, edged, place, reach, beside, optics, noise)
+    places = free_places(film, balls, place, reach, optics, noise)
+    clear = balls.rows(~touching & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
+    under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
+    balls, ratio = settle(film, balls, places, under, ~touching, edged, beside, optics, noise)
     images = _table(film, bits, balls, under, ratio, touching, others, optics, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
@@ -272,7 +274,7 @@ def _table(
     edge = (position < reach[:, None]).any(1) | (position[:, 0] > film.shape[1] - 1 - reach) | (position[:, 1] > film.shape[0] - 1 - reach)
     flags[edge] |= MarkerFlag.EDGE
     valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in tees]])
-    flags[(valid < 0.999) & ~edge] |= MarkerFlag.SATURATED
+    flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < 0.8] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
     under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
@@ -286,13 +288,6 @@ def _table(
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, snr, flags)
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1]))))
-
-
-def _variance_under(balls: BallFits, touching: Bool, optics: Optics, noise: NoiseModel) -> float:
-    clear = ~touching & (balls.valid_fraction > 0.999) & (balls.chi2_ring < STRUCTURE)
-    if np.count_nonzero(clear) < _ENOUGH_BALLS:
-        return 1.0
-    return float(np.clip(noise_under(balls.chi2_uneven[clear], balls.radius_px[clear], optics, noise), *_MOST_UNDER))
 
 
 def _excess(fit: NeedleFit, noise: NoiseModel) -> float:

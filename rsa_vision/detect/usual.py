@@ -1,0 +1,89 @@
+"""What the balls of a film have in common: their size, and how their depth goes with the background."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsa_vision.detect.alike import true_spread
+from rsa_vision.detect.balls import BallFits
+from rsa_vision.types import Float
+
+_ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
+_LEAST_BALLS = 5  # whose depths tell how they go with the background
+_OUTLIER = 3.0
+_SD_OF_MAD = 1.4826
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Radii of a film's balls.
+
+    Attributes
+    ----------
+    log_radius, spread : float
+        Mean and standard deviation of the logarithm of the radius in pixels.
+    """
+
+    log_radius: float
+    spread: float
+
+    @property
+    def radius_px(self) -> float:
+        """Usual radius."""
+        return float(np.exp(self.log_radius))
+
+    @property
+    def radius_sd_px(self) -> float:
+        """By how much radii differ from it."""
+        return self.spread * self.radius_px
+
+
+def usual_size(clear: BallFits) -> Size:
+    """Return the size of these balls, with what they truly differ by."""
+    centre, spread, _ = true_spread(np.log(clear.radius_px), clear.covariance[:, 2, 2] / clear.radius_px**2)
+    return Size(centre, min(spread, _ANYTHING))
+
+
+@dataclass(frozen=True, slots=True)
+class Proportion:
+    """Change of a ball's depth with the background, both in film values, and its standard deviation."""
+
+    slope: float
+    sd: float
+
+
+def proportion(depth: Float, background: Float, beside: Float) -> Proportion:
+    """Tell how depths go with the background: not at all on logarithmic films, like it on linear ones.
+
+    The fits' own backgrounds have errors that are those of the depths with the other sign. Values farther off have not, and go with the
+    backgrounds all the same: they are the instrument of the regression (Wright, 1928), by their ranks. The prior is centred on none and as
+    wide as a linear film's.
+
+    Parameters
+    ----------
+    depth, background : ndarray of shape (n,)
+        Of clear balls.
+    beside : ndarray of shape (n,)
+        Values of the film beside them.
+
+    Returns
+    -------
+    Proportion
+    """
+    if len(depth) < _LEAST_BALLS:
+        return Proportion(0.0, 0.0)
+    rank = np.argsort(np.argsort(beside)) - 0.5 * (len(beside) - 1)
+    middle = float(np.median(depth))
+    far = _OUTLIER * _SD_OF_MAD * float(np.median(np.abs(depth - middle)))
+    depth = np.clip(depth, middle - far, middle + far)
+    of_linear = abs(middle / float(np.median(background)))
+    shared = float(rank @ background)
+    if shared <= 0:
+        return Proportion(0.0, of_linear)
+    slope = float(rank @ depth) / shared
+    left = depth - depth.mean() - slope * (background - background.mean())
+    error = float(np.sqrt(left @ left / (len(left) - 2) * (rank @ rank))) / shared
+    drawn = 1 + (error / of_linear) ** 2
+    return Proportion(slope / drawn, error / np.sqrt(drawn))
