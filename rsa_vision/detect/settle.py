@@ -75,7 +75,7 @@ def settle(
     Returns
     -------
     balls : BallFits
-        With new centres, their covariances, and what is left of the odd part.
+        With new centres, their covariances, and what is left of the windows.
     ratio : ndarray of shape (n,)
         Squared errors that free places would make of these centres over those that the covariances promise.
     """
@@ -226,7 +226,9 @@ def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) ->
     distance = np.hypot(cols - found.local_px[:, :1], rows - found.local_px[:, 1:])
     core = distance < (found.radius_px + common.optics.sigma_px)[:, None]
     under, ring = (uneven(found.residual, found.weight, found.local_px, side, where) for where in (core, ~core))
-    return replace(fits, position_px=found.local_px + windows.corner_px, covariance=covariance, chi2_uneven=under, chi2_ring=ring)
+    left = (found.weight * found.residual**2 * core).sum(axis=1) / np.maximum((core & windows.valid).sum(axis=1), 1)
+    position = found.local_px + windows.corner_px
+    return replace(fits, position_px=position, covariance=covariance, chi2_core=left, chi2_uneven=under, chi2_ring=ring)
 
 
 def _precision(known: Modes, structure: Float, fits: BallFits, noise: NoiseModel) -> Float:
@@ -287,7 +289,7 @@ def _by(response: Float, variance: Float) -> Float:
 def _put(balls: BallFits, part: Int, fits: BallFits, moved: Bool) -> BallFits:
     """Put the new centres in the place of the old ones."""
     changed = {}
-    for name in ("position_px", "covariance", "chi2_uneven", "chi2_ring"):
+    for name in ("position_px", "covariance", "chi2_core", "chi2_uneven", "chi2_ring"):
         changed[name] = getattr(balls, name).copy()
         changed[name][part[moved]] = getattr(fits, name)[moved]
     return replace(balls, **changed)
