@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, slopes, uneven
 from rsa_vision.detect.decide import EDGE
+from rsa_vision.detect.find import CHANCE
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
@@ -32,12 +33,15 @@ Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 _NONE = 1e-3  # of the noise: what is not there
-_STEPS = 3  # from where the fit on a quadratic background came to rest
+_STEPS = 4  # from where the fit on a quadratic background came to rest
 _MAX_STEP_PX = 0.7
 _FIXED = 1e6  # inverse variance of a radius that is not fitted
 _OUTLIER = 3.0  # standard deviations from which a ball has a size of its own
 _QUIETEST = 0.6  # less than that is chance
 _QUARTILE, _OF_CHANCE = 0.75, 2.773  # the upper one, of chi2 with two degrees of freedom: errors by bone have longer tails than it
+_FAR = 5.0  # standard deviations that noise does not reach
+_SD_OF_MAD = 1.4826
+_MOST_FOREIGN = 0.3  # part of what is around a ball
 _PER_BALL = 10  # centre, radius, depth, and the six coefficients of a quadratic surface
 _BATCH = 20
 _SHARES = np.exp(np.linspace(-3.0, 6.0, 28))  # of structure in a window, of that at the places around it
@@ -67,7 +71,7 @@ def settle(
     free : ndarray of bool, shape (n,)
         Not fitted together with a neighbour: those stay as they are.
     edged : ndarray of bool, shape (n,)
-        Fitted together with an edge: those stay if they are beside one, of which bending surfaces leave much.
+        Fitted together with an edge: those stay if bending surfaces leave more of it.
     beside : callable
     optics : Optics
     noise : NoiseModel
@@ -101,7 +105,8 @@ def settle(
             windows = _windows(film, balls, part, these.half, beside, noise)
             solution = _solve(windows, known, structure[part], common)
             fits = _fits(windows, solution, known, common)
-            out = _put(out, part, fits, free[part] & ~(edged[part] & (fits.chi2_ring > STRUCTURE)))
+            left = fits.chi2_uneven - balls.chi2_uneven[part] > CHANCE * noise.scatter(fits.n_core)
+            out = _put(out, part, fits, free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left)))
             mine = (these.near >= begin) & (these.near < begin + _BATCH)
             by_background = solution.estimator * solution.shade
             errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
@@ -178,7 +183,7 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
     target, held = _hold(fits, common)
     precision = np.zeros((len(depth), 4 + len(surface)))
     precision[:, 2], precision[:, _PER_BALL:] = held, _precision(known, structure, fits, noise)
-    each = np.arange(precision.shape[1])
+    each, valid = np.arange(precision.shape[1]), windows.valid
     for step in range(_STEPS):
         shapes = slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, sigma_px)
         value, *by = (shape.astype(np.float64) for shape in shapes)
@@ -189,7 +194,7 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         curves[:, 0] = surface[0]
         images = np.concatenate([np.stack([-depth[:, None] * by[0], -depth[:, None] * by[1], depth[:, None] * by[2], value], 1), curves], 1)
         left = windows.data - ball
-        weight = windows.valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
+        weight = valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
         weighted = images * weight[:, None]
         normal, right = np.matmul(weighted, images.swapaxes(1, 2)), np.matmul(weighted, left[:, :, None])[:, :, 0]
         if step == 1:  # once the background is known roughly
@@ -204,7 +209,9 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         local = local + scale[:, None] * change[:, :2]
         radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
-    residual = left - np.matmul(change[:, None], images)[:, 0]
+        residual = left - np.matmul(change[:, None], images)[:, 0]
+        outside = np.hypot(cols - local[:, :1], rows - local[:, 1:]) > (radius + sigma_px)[:, None]
+        valid = windows.valid & ~_foreign(residual, weight, windows.valid & outside)
     return _Solution(local, radius, images, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure)
 
 
@@ -234,6 +241,15 @@ def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) ->
 def _precision(known: Modes, structure: Float, fits: BallFits, noise: NoiseModel) -> Float:
     # correlated noise makes a fit surer than it is: held in the same proportion, surfaces bend as far as they should
     return np.asarray(1 / (np.maximum(structure[:, known.degree], _NONE) * noise.variance_at(fits.background)[:, None]))
+
+
+def _foreign(residual: Float, weight: Float, where: Bool) -> Bool:
+    """Say which pixels around balls belong to other things: wires, dust, scratches. Where it is much, the background itself is another."""
+    off = np.abs(residual) * np.sqrt(weight)
+    usual = np.array([np.median(row[here]) if here.any() else 0.0 for row, here in zip(off, where & (weight > 0), strict=True)])
+    found = where & (off > _FAR * np.maximum(1.0, _SD_OF_MAD * usual)[:, None])
+    little = found.sum(axis=1) < _MOST_FOREIGN * where.sum(axis=1)
+    return np.asarray(found & little[:, None])
 
 
 def _own_share(normal: Float, right: Float, precision: Float, gain: Float, differ: float) -> Float:

@@ -97,3 +97,18 @@ def test_a_ball_of_another_size_keeps_its_own() -> None:
     clear = film_of_balls((600, 600), truth, radius, depth=0.4, sigma_px=1.2, noise_sd=300.0, rng=rng)
     error, sd = _errors(clear, truth)
     assert (np.abs(error[17]) < 4 * sd[17]).all()
+
+
+def test_dust_beside_a_ball_does_not_pull_at_it() -> None:
+    rng = np.random.default_rng(61)
+    truth, radius = grid_of_balls(rng, 8, 90.0, (4.0, 4.5))
+    clear = film_of_balls((760, 760), truth, radius, depth=0.4, sigma_px=1.2, noise_sd=200.0, rng=rng)
+    row, col = np.mgrid[0:760, 0:760]
+    specks = np.zeros((760, 760))
+    for centre in truth[::2]:  # each ball has one at 5 px from its rim, on the right
+        specks += np.exp(-0.5 * ((col - centre[0] - 9.5) ** 2 + (row - centre[1]) ** 2) / 1.3**2)
+    error, sd = _errors(clear + 6000.0 * specks, truth)
+    pull, chance = error[::2, 0].mean(), sd[::2, 0].mean() / np.sqrt(len(truth) / 2)
+    print(f"pull of specks {pull:.4f} px, one standard deviation {chance:.4f}")
+    assert abs(pull) < 0.02
+    assert (np.abs(error) < 5 * sd).all()
