@@ -33,6 +33,7 @@ Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 _NONE = 1e-3  # of the noise: what is not there
+_SHIFT = 0.25  # part of what two models of an edge differ by, squared
 _STEPS = 4  # from where the fit on a quadratic background came to rest
 _MAX_STEP_PX = 0.7
 _FIXED = 1e6  # inverse variance of a radius that is not fitted
@@ -106,6 +107,8 @@ def settle(
             solution = _solve(windows, known, structure[part], common)
             fits = _fits(windows, solution, known, common)
             left = fits.chi2_uneven - balls.chi2_uneven[part] > CHANCE * noise.scatter(fits.n_core)
+            apart = np.where(edged[part], 1.0, 0.0)[:, None] * (fits.position_px - balls.position_px[part])
+            fits.covariance[:, :2, :2] += _SHIFT * apart[:, :, None] * apart[:, None]  # both models could be right
             out = _put(out, part, fits, free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left)))
             mine = (these.near >= begin) & (these.near < begin + _BATCH)
             by_background = solution.estimator * solution.shade
