@@ -12,6 +12,7 @@ from rsa_vision.types import Float
 
 _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
+_LEAST_VALUE = 1.0  # of a film
 _OUTLIER = 3.0
 _SD_OF_MAD = 1.4826
 
@@ -72,13 +73,15 @@ def proportion(depth: Float, background: Float, beside: Float) -> Proportion:
     -------
     Proportion
     """
-    if len(depth) < _LEAST_BALLS:
+    if len(depth) == 0:
         return Proportion(0.0, 0.0)
+    of_linear = abs(float(np.median(depth))) / max(abs(float(np.median(background))), _LEAST_VALUE)
+    if len(depth) < _LEAST_BALLS:
+        return Proportion(0.0, of_linear)
     rank = np.argsort(np.argsort(beside)) - 0.5 * (len(beside) - 1)
     middle = float(np.median(depth))
     far = _OUTLIER * _SD_OF_MAD * float(np.median(np.abs(depth - middle)))
     depth = np.clip(depth, middle - far, middle + far)
-    of_linear = abs(middle / float(np.median(background)))
     shared = float(rank @ background)
     if shared <= 0:
         return Proportion(0.0, of_linear)
