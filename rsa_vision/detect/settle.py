@@ -32,6 +32,7 @@ Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
 """Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
+_TINY = 1e-12
 _NONE = 1e-3  # of the noise: what is not there
 _SHIFT = 0.25  # part of what two models of an edge differ by, squared
 _STEPS = 4  # from where the fit on a quadratic background came to rest
@@ -289,7 +290,7 @@ def _held_over(values: NDArray[Any], near: Int, estimator: Float, known: Modes, 
     side = round(np.sqrt(values.shape[1]))
     mean = values.mean(axis=1)
     stated = influence_covariance(estimator.reshape(-1, 2, side, side), noise.correlation)
-    stated = stated + _by(estimator @ known.surface, _variance(known, structure))
+    stated = stated + _by(estimator @ known.surface, _variance(known, structure)) + _TINY * np.eye(2)  # a ball may lie wholly under others
     error = np.einsum("kip,kp->ki", estimator[near], values - mean[:, None])
     square = np.einsum("ki,ki->k", error, np.linalg.solve(stated[near], error[:, :, None])[:, :, 0])
     return np.asarray(square / noise.variance_at(mean) / _OF_CHANCE)
