@@ -11,6 +11,7 @@ from rsa_vision.types import Bool, Float
 
 _LEAST = 5  # from so many on their scatter tells something
 _OUTLIER = 3.0  # standard deviations
+SD_OF_MAD = 1.4826  # standard deviation of what is normal in units of its median deviation
 _MEDIAN_CHI2 = 0.455  # of one degree of freedom
 
 

@@ -27,6 +27,7 @@ Background = Callable[[Float, Float], Float]
 TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the fit of the other
 _MOST_IN_GROUP = 5
 DOUBTFUL = 0.6  # of the misfit that a ball may leave: more may be two balls
+OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added to the stated variance
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
 _FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
 _LEAST_KNOWN = 3  # balls that tell what one of them looks like on this film
@@ -151,7 +152,7 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
             continue
         shift = edged.position_px - plain.position_px
         covariance = edged.covariance.copy()
-        covariance[:, :2, :2] += 0.25 * shift[:, :, None] * shift[:, None, :]
+        covariance[:, :2, :2] += OF_SHIFT * shift[:, :, None] * shift[:, None, :]
         parts.append(replace(edged, covariance=covariance))
         edged_too[-1][:] = True
     return join(parts), np.concatenate([np.zeros(0, bool), *edged_too])

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.alike import SD_OF_MAD
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, slopes, uneven
 from rsa_vision.detect.decide import EDGE
@@ -24,6 +25,7 @@ from rsa_vision.detect.find import CHANCE
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
+from rsa_vision.detect.resolve import OF_SHIFT
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import Proportion, Size, proportion, usual_size
 from rsa_vision.types import Bool, Float, Int
@@ -34,7 +36,6 @@ Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 _TINY = 1e-12
 _NONE = 1e-3  # of the noise: what is not there
-_SHIFT = 0.25  # part of what two models of an edge differ by, squared
 _STEPS = 4  # from where the fit on a quadratic background came to rest
 _MAX_STEP_PX = 0.7
 _FIXED = 1e6  # inverse variance of a radius that is not fitted
@@ -42,7 +43,6 @@ _OUTLIER = 3.0  # standard deviations from which a ball has a size of its own
 _QUIETEST = 0.6  # less than that is chance
 _QUARTILE, _OF_CHANCE = 0.75, 2.773  # the upper one, of chi2 with two degrees of freedom: errors by bone have longer tails than it
 _FAR = 5.0  # standard deviations that noise does not reach
-_SD_OF_MAD = 1.4826
 _MOST_FOREIGN = 0.3  # part of what is around a ball
 _PER_BALL = 10  # centre, radius, depth, and the six coefficients of a quadratic surface
 _BATCH = 20
@@ -109,7 +109,7 @@ def settle(
             fits = _fits(windows, solution, known, common)
             left = fits.chi2_uneven - balls.chi2_uneven[part] > CHANCE * noise.scatter(fits.n_core)
             apart = np.where(edged[part], 1.0, 0.0)[:, None] * (fits.position_px - balls.position_px[part])
-            fits.covariance[:, :2, :2] += _SHIFT * apart[:, :, None] * apart[:, None]  # both models could be right
+            fits.covariance[:, :2, :2] += OF_SHIFT * apart[:, :, None] * apart[:, None]  # both models could be right
             out = _put(out, part, fits, free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left)))
             mine = (these.near >= begin) & (these.near < begin + _BATCH)
             by_background = solution.estimator * solution.shade
@@ -214,8 +214,9 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
         residual = left - np.matmul(change[:, None], images)[:, 0]
-        outside = np.hypot(cols - local[:, :1], rows - local[:, 1:]) > (radius + sigma_px)[:, None]
-        valid = windows.valid & ~_foreign(residual, weight, windows.valid & outside)
+        if step + 1 < _STEPS:
+            outside = np.hypot(cols - local[:, :1], rows - local[:, 1:]) > (radius + sigma_px)[:, None]
+            valid = windows.valid & ~_foreign(residual, weight, windows.valid & outside)
     return _Solution(local, radius, images, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure)
 
 
@@ -251,7 +252,7 @@ def _foreign(residual: Float, weight: Float, where: Bool) -> Bool:
     """Say which pixels around balls belong to other things: wires, dust, scratches. Where it is much, the background itself is another."""
     off = np.abs(residual) * np.sqrt(weight)
     usual = np.array([np.median(row[here]) if here.any() else 0.0 for row, here in zip(off, where & (weight > 0), strict=True)])
-    found = where & (off > _FAR * np.maximum(1.0, _SD_OF_MAD * usual)[:, None])
+    found = where & (off > _FAR * np.maximum(1.0, SD_OF_MAD * usual)[:, None])
     little = found.sum(axis=1) < _MOST_FOREIGN * where.sum(axis=1)
     return np.asarray(found & little[:, None])
 

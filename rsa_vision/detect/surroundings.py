@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, polygamma
 
+from rsa_vision.detect.alike import SD_OF_MAD
 from rsa_vision.detect.balls import BallFits, half_size
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
@@ -19,7 +20,6 @@ from rsa_vision.types import Float, Int
 _DIRECTIONS = 2 * np.pi * np.arange(8) / 8
 _FARTHER = (1.0, 1.5, 2.2)  # distances, in units of the nearest one that is free of the ball
 _DEGREES = range(3, 7)  # of surfaces beyond the quadratic one; finer ones do not look like a shift of the ball
-_SD_OF_MAD = 1.4826
 _LEAST_DIFFER = 0.2  # of structure from window to window
 _LEAST = 4  # free places from which a ball's surroundings tell something
 
@@ -158,7 +158,7 @@ def texture(places: list[Places], count: int, noise: NoiseModel) -> Texture:
     structure = around_each([e / (chdtri(freedom, 0.5) / freedom) for e in energies], places, count, 1.0) - 1.0
     both = [(e / (1 + structure[these.balls[these.near]])) @ freedom / freedom.sum() for e, these in zip(energies, places, strict=True)]
     logs = np.log(np.maximum(np.concatenate([np.ones(1), *both]), 1e-9))
-    scatter = _SD_OF_MAD * float(np.median(np.abs(logs - np.median(logs))))
+    scatter = SD_OF_MAD * float(np.median(np.abs(logs - np.median(logs))))
     return Texture(structure, float(np.sqrt(max(scatter**2 - polygamma(1, 0.5 * freedom.sum()), _LEAST_DIFFER**2))))
 
 

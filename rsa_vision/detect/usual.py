@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsa_vision.detect.alike import true_spread
+from rsa_vision.detect.alike import SD_OF_MAD, true_spread
 from rsa_vision.detect.balls import BallFits
 from rsa_vision.types import Float
 
@@ -14,7 +14,6 @@ _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
 _LEAST_VALUE = 1.0  # of a film
 _OUTLIER = 3.0
-_SD_OF_MAD = 1.4826
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,7 @@ def proportion(depth: Float, background: Float, beside: Float) -> Proportion:
         return Proportion(0.0, of_linear)
     rank = np.argsort(np.argsort(beside)) - 0.5 * (len(beside) - 1)
     middle = float(np.median(depth))
-    far = _OUTLIER * _SD_OF_MAD * float(np.median(np.abs(depth - middle)))
+    far = _OUTLIER * SD_OF_MAD * float(np.median(np.abs(depth - middle)))
     depth = np.clip(depth, middle - far, middle + far)
     shared = float(rank @ background)
     if shared <= 0:

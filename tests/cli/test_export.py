@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -86,14 +87,14 @@ def read_xmalab(path: Path) -> dict[str, np.ndarray]:
     ("name", "read", "tolerance_mm"), [("m.trc", read_trc, PRINTED_MM), ("m.c3d", read_c3d, SINGLE_MM), ("m.csv", read_xmalab, PRINTED_MM)]
 )
 def test_what_is_written_is_read_back(
-    name: str, read: object, tolerance_mm: float, markers: Path, capsys: pytest.CaptureFixture[str]
+    name: str, read: Callable[[Path], dict[str, np.ndarray]], tolerance_mm: float, markers: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if name.endswith("c3d"):
         pytest.importorskip("ezc3d")
     out = markers.with_name(name)
     assert run_app(["export", str(markers), "-o", str(out)]) == 0
     assert "8 markers in 3 frames, 2 places missing" in capsys.readouterr().out
-    found, expected = read(out), truth(markers)  # type: ignore[operator]
+    found, expected = read(out), truth(markers)
     assert set(found) == set(expected)
     for marker, places in expected.items():
         assert np.allclose(found[marker], places, rtol=0, atol=tolerance_mm, equal_nan=True), marker
