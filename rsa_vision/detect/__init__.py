@@ -24,6 +24,7 @@ from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import images_beside, resolve_balls
+from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
 from rsa_vision.detect.surroundings import free_places
@@ -35,6 +36,8 @@ __all__ = ["Detection", "detect_markers"]
 
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 WHOLE = 0.999  # part of the pixels under a ball
+POOR = 0.6  # of the misfit that a ball may leave
+BENT = 1.5  # the same once an edge or bending surfaces around it could have taken it up
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
@@ -204,7 +207,11 @@ def _one_polarity(
     clear = balls.rows(~touching & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
     under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
     balls, ratio = settle(film, balls, places, under, ~touching, edged, beside, optics, noise)
-    images = _table(film, bits, balls, under, ratio, touching, others, optics, noise)
+    left, poor = _what_is_left(balls, under, noise)
+    keep = left < BENT * MISFIT
+    keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
+    balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
+    images = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
     return evidence, Detection(images, sign < 0, optics, noise)
@@ -237,6 +244,13 @@ def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
     return out
 
 
+def _what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Float, Bool]:
+    """Return the misfit of each ball, and which are not described well."""
+    under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
+    left = misfit(under, noise, CHANCE)
+    return left, (left > POOR * MISFIT) | (balls.chi2_ring > EDGE)
+
+
 def _table(
     film: NDArray[Any],
     bits: int,
@@ -244,6 +258,7 @@ def _table(
     usual: float,
     ratio: Float,
     touching: Bool,
+    poor_ball: Bool,
     tees: list[NeedleFit],
     optics: Optics,
     noise: NoiseModel,
@@ -277,9 +292,7 @@ def _table(
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < 0.8] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
-    under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
-    poor = np.concatenate([misfit(under, noise, CHANCE), [t.misfit for t in tees]]) > 0.6 * MISFIT
-    poor[:n] |= balls.chi2_ring > EDGE
+    poor = np.concatenate([poor_ball, np.array([t.misfit for t in tees]) > POOR * MISFIT])
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it
     covariance[poor] += (_SOMEWHERE * radius[poor] ** 2)[:, None, None] * np.eye(2)

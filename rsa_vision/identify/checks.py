@@ -10,10 +10,10 @@ from rsa_vision.identify.appearance import FilmImages, angle_difference_deg
 from rsa_vision.identify.film_model import FILM, Scene
 from rsa_vision.identify.naming import Naming
 from rsa_vision.settings import Limits
-from rsa_vision.types import Float
+from rsa_vision.types import Bool, Float
 
 LOG_FAR: Final = 7.0  # a focus beyond the limit is that much less likely
-FOUND: Final = 0.55  # of the fiducial marks and of the control points of a focus must be named: no single row of a cage of two
+FOUND: Final = 0.55  # of the fiducial marks of a film and of the control points of a focus must be named: no single row of a cage of two
 SPREAD: Final = 0.3  # of the breadth of the cage's own fiducial marks must be left to the named ones
 FIXED_MM: Final = 10.0  # sd of a focus along any axis: a tenth of what is presumed of it, its control points fix it and not the presumption
 STRETCH: Final = 0.017  # largest half anisotropy and shear of a film, 2 % each; cages 1B and 1B-420 differ by 0.025
@@ -36,18 +36,23 @@ def are_different(scene: Scene, a: Naming, b: Naming) -> bool:
 
 def what_is_missing(scene: Scene, naming: Naming) -> str:
     """Return in words which marks are too few, or do not fix the plane or a focus, else nothing."""
+    fiducials = scene.own & scene.fiducial  # of all foci together: they lie in one plane
+    if few := _too_few(naming, fiducials, 4, "fiducial marks"):
+        return few
+    if _breadth(scene.xyz_mm[fiducials & (naming.image >= 0)]) < SPREAD * _breadth(scene.xyz_mm[fiducials]):
+        return "the fiducial marks found lie nearly in line"
     for k, focus in enumerate(scene.foci):
-        for fiducial, least, name in ((True, 4, "fiducial marks"), (False, 2, "control points")):
-            wanted = scene.own & (scene.focus == k) & (scene.fiducial == fiducial)
-            seen = int((naming.image[wanted] >= 0).sum())
-            if seen < max(least, np.ceil(FOUND * wanted.sum())):
-                return f"only {seen} of {wanted.sum()} {name} of focus {focus}"
-            if fiducial and _breadth(scene.xyz_mm[wanted & (naming.image >= 0)]) < SPREAD * _breadth(scene.xyz_mm[wanted]):
-                return f"the {name} found of focus {focus} lie nearly in line"
+        if few := _too_few(naming, scene.own & (scene.focus == k) & ~scene.fiducial, 2, f"control points of focus {focus}"):
+            return few
         place = slice(FILM + 3 * k, FILM + 3 * k + 3)
         if np.linalg.eigvalsh(naming.fit.covariance[place, place])[-1] > FIXED_MM**2:  # two points fix a focus unless they lie in one place
             return f"the control points found of focus {focus} lie too close together"
     return ""
+
+
+def _too_few(naming: Naming, wanted: Bool, least: int, name: str) -> str:
+    seen = int((naming.image[wanted] >= 0).sum())
+    return f"only {seen} of {wanted.sum()} {name}" if seen < max(least, np.ceil(FOUND * wanted.sum())) else ""
 
 
 def _breadth(points: Float) -> float:
