@@ -12,6 +12,7 @@ import numpy as np
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.rays import RayBundle, intersect_lines
 from rsa_vision.identify.cage import CageIdentification
+from rsa_vision.identify.contrasts import contrasts_alike
 from rsa_vision.identify.lone import chance_of_marker
 from rsa_vision.identify.pairs import Pairing
 from rsa_vision.types import Bool, Float, ImagePoints, Int, MarkerImages
@@ -75,8 +76,8 @@ class Readings:
 
     @property
     def contrast(self) -> Float:
-        """Contrasts in the table of all images."""
-        return np.concatenate([film.images.contrast for film in self.films])
+        """Contrasts in the table of all images, as they would be on one background of each film."""
+        return np.concatenate([_contrasts_alike(film.images) for film in self.films])
 
     @property
     def source(self) -> Int:
@@ -162,6 +163,11 @@ def name_objects(named: Readings, table: Readings, bundle: RayBundle, pairing: P
     every = np.concatenate([named.rows, np.array(rows, int), others])
     joined = _concatenated([named.points, points, table.points.rows(others)])
     return named.with_points(replace(joined, flags=joined.flags | flags[every]), every)
+
+
+def _contrasts_alike(images: MarkerImages) -> Float:
+    clear = (images.shape == "ball") & (image_quality(images.flags) == 0)
+    return contrasts_alike(images.contrast, images.background, clear)
 
 
 def image_quality(flags: Int) -> Int:

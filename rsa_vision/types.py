@@ -78,6 +78,8 @@ class MarkerImages(Table):
         as displayed (row down): ``atan2(-drow, dcol)``. NaN for balls.
     contrast : ndarray of shape (n,)
         Fitted depth of the image, as a part of the film's full scale; positive for either polarity.
+    background : ndarray of shape (n,)
+        What the film would be there without the mark, as a part of its full scale; NaN where not known.
     snr : ndarray of shape (n,)
         Contrast over the noise of one pixel.
     flags : ndarray of int, shape (n,)
@@ -90,6 +92,7 @@ class MarkerImages(Table):
     radius_px: Float
     angle_deg: Float
     contrast: Float
+    background: Float
     snr: Float
     flags: Int
 
@@ -97,7 +100,7 @@ class MarkerImages(Table):
     def empty(cls) -> MarkerImages:
         """Return a table without rows."""
         none = np.zeros(0)
-        return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, "U4"), none, none, none, none, np.zeros(0, np.int64))
+        return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, "U4"), none, none, none, none, none, np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -311,7 +311,8 @@ def _detected(table: _Table, shape: tuple[int, int], places: Mapping[Source, Flo
     contrast = np.array(table.contrast, float) * np.exp(rng.normal(0, 0.03, n))
     radius = radius * np.exp(rng.normal(0, sd / radius))
     covariance = (sd**2)[:, None, None] * np.eye(2)
-    images = MarkerImages(position, covariance, kind, radius, np.array(table.angle, float), contrast, 100 * contrast, flags)
+    unknown = np.full(n, np.nan)
+    images = MarkerImages(position, covariance, kind, radius, np.array(table.angle, float), contrast, unknown, 100 * contrast, flags)
     order = rng.permutation(np.flatnonzero(keep))
     return FilmTruth(images.rows(order), shape, [named[i] for i in order], places, e.slack_mm / e.pitch_mm)
 

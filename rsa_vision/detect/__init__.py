@@ -302,7 +302,7 @@ def _table(
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
-    table = MarkerImages(position, covariance, shape, radius, angle, depth / full, snr, flags)
+    table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1]))))
 
 

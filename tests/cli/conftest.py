@@ -59,6 +59,7 @@ def count_detections(exams: list[RenderedExamination], monkeypatch: pytest.Monke
                 radius_px=np.full(n, 3.0),
                 angle_deg=np.full(n, np.nan),
                 contrast=np.full(n, 0.5),
+                background=np.full(n, 0.7),
                 snr=np.full(n, 50.0),
                 flags=np.zeros(n, np.int64),
             )

@@ -51,7 +51,7 @@ def biplane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Floa
         px = seen(points, turn) + rng.normal(0, SD_PX, (9, 2))
         n = len(px)
         cov = np.tile(np.eye(2) * SD_PX**2, (n, 1, 1))
-        look = (np.full(n, "ball"), np.full(n, 2.5), np.full(n, np.nan), np.full(n, 0.5), np.full(n, 40.0), np.zeros(n, np.int64))
+        look = (np.full(n, "ball"), np.full(n, 2.5), np.full(n, np.nan), *np.full((2, n), 0.5), np.full(n, 40.0), np.zeros(n, np.int64))
         known[int(film[0, 0]), int(film[0, 1])] = MarkerImages(px, cov, *look)
         (folder / f"calib_f{focus}.txt").write_text(camera_text(turn))
         lines.append(f'{focus} = "calib_f{focus}.txt"')

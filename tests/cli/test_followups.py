@@ -72,6 +72,7 @@ def hide(films: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
                 radius_px=np.full(n, 3.0),
                 angle_deg=np.full(n, np.nan),
                 contrast=np.full(n, 0.5),
+                background=np.full(n, 0.7),
                 snr=np.full(n, 50.0),
                 flags=np.zeros(n, np.int64),
             )

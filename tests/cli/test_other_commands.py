@@ -37,6 +37,7 @@ def two_images(monkeypatch: pytest.MonkeyPatch) -> MarkerImages:
         radius_px=np.array([4.0, 2.5]),
         angle_deg=np.array([np.nan, 90.0]),
         contrast=np.array([0.6, 0.3]),
+        background=np.array([0.8, 0.5]),
         snr=np.array([40.0, 20.0]),
         flags=np.array([0, MarkerFlag.EDGE | MarkerFlag.SATURATED]),
     )

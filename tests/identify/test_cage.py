@@ -244,7 +244,15 @@ def images_at(position: np.ndarray, shape: str = "tee") -> MarkerImages:
     n = len(position)
     ones = np.ones(n)
     return MarkerImages(
-        position, 0.01 * np.tile(np.eye(2), (n, 1, 1)), np.full(n, shape), 3 * ones, 90 * ones, ones / 3, 30 * ones, np.zeros(n, int)
+        position,
+        0.01 * np.tile(np.eye(2), (n, 1, 1)),
+        np.full(n, shape),
+        3 * ones,
+        90 * ones,
+        ones / 3,
+        ones / 2,
+        30 * ones,
+        np.zeros(n, int),
     )
 
 
