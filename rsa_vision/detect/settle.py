@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.alike import SD_OF_MAD
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, slopes, uneven
 from rsa_vision.detect.decide import EDGE
@@ -26,6 +25,7 @@ from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.resolve import OF_SHIFT
+from rsa_vision.detect.foreign import foreign, in_line, robust_residual
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import Proportion, Size, proportion, usual_size
 from rsa_vision.types import Bool, Float, Int
@@ -34,6 +34,8 @@ Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
 """Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
+_UNEVEN = 1.25  # the same, from which something may lie there
+_MOST_COVERED = 0.75  # of a ball: from less it cannot be measured
 _TINY = 1e-12
 _NONE = 1e-3  # of the noise: what is not there
 _STEPS = 4  # from where the fit on a quadratic background came to rest
@@ -42,8 +44,6 @@ _FIXED = 1e6  # inverse variance of a radius that is not fitted
 _OUTLIER = 3.0  # standard deviations from which a ball has a size of its own
 _QUIETEST = 0.6  # less than that is chance
 _QUARTILE, _OF_CHANCE = 0.75, 2.773  # the upper one, of chi2 with two degrees of freedom: errors by bone have longer tails than it
-_FAR = 5.0  # standard deviations that noise does not reach
-_MOST_FOREIGN = 0.3  # part of what is around a ball
 _PER_BALL = 10  # centre, radius, depth, and the six coefficients of a quadratic surface
 _BATCH = 20
 _SHARES = np.exp(np.linspace(-3.0, 6.0, 28))  # of structure in a window, of that at the places around it
@@ -104,13 +104,18 @@ def settle(
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
         for begin in range(0, len(these.balls), _BATCH):
             part = these.balls[begin : begin + _BATCH]
-            windows = _windows(film, balls, part, these.half, beside, noise)
+            windows = _without_others(_windows(film, balls, part, these.half, beside, noise), common)
             solution = _solve(windows, known, structure[part], common)
             fits = _fits(windows, solution, known, common)
             left = fits.chi2_uneven - balls.chi2_uneven[part] > CHANCE * noise.scatter(fits.n_core)
-            apart = np.where(edged[part], 1.0, 0.0)[:, None] * (fits.position_px - balls.position_px[part])
-            fits.covariance[:, :2, :2] += OF_SHIFT * apart[:, :, None] * apart[:, None]  # both models could be right
-            out = _put(out, part, fits, free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left)))
+            crossed, apart = windows.covered > 0, fits.position_px - balls.position_px[part]
+            both = OF_SHIFT * apart[:, :, None] * apart[:, None] * edged[part, None, None]  # both models could be right
+            both += OF_SHIFT * ((apart**2).sum(axis=1) * crossed)[:, None, None] * np.eye(2)  # what lies on a ball has any profile
+            fits.covariance[:, :2, :2] += both
+            moved = free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left)) & (windows.covered < _MOST_COVERED)
+            out = _put(out, part, fits, moved)
+            stay = free[part] & crossed & ~moved
+            out.covariance[part[stay], :2, :2] += both[stay]
             mine = (these.near >= begin) & (these.near < begin + _BATCH)
             by_background = solution.estimator * solution.shade
             errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
@@ -140,6 +145,7 @@ class _Windows:
     data: Float  # (n, pixels), less neighbours and the background at the centre
     added: Float  # (n, pixels), those
     valid: Bool  # (n, pixels)
+    covered: Float  # (n,), part of the ball on which something else lies
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +179,37 @@ def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: 
     added = np.stack([image for image, _ in near]) + fits.background[:, None, None]
     flat = (len(part), -1)
     return _Windows(
-        fits, half, corner, (patches.values - added).reshape(flat), added.reshape(flat), (patches.valid & ~doubtful).reshape(flat)
+        fits,
+        half,
+        corner,
+        (patches.values - added).reshape(flat),
+        added.reshape(flat),
+        (patches.valid & ~doubtful).reshape(flat),
+        np.zeros(len(part)),
+    )
+
+
+def _without_others(windows: _Windows, common: _Common) -> _Windows:
+    """Mask the pixels of wires, dust and scratches, under the balls as well."""
+    fits, half, noise, sigma_px = windows.fits, windows.half, common.noise, common.optics.sigma_px
+    rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
+    local, rim = fits.position_px - windows.corner_px, fits.radius_px + sigma_px
+    table = ball_table(round(common.optics.mu_px * sigma_px, 3))
+    value, *by = (shape.astype(np.float64) for shape in slopes(table, cols - local[:, :1], rows - local[:, 1:], fits.radius_px, sigma_px))
+    surface = np.broadcast_to(polynomial(half, cols - half, rows - half).T, (len(local), 6, len(cols)))
+    images = np.concatenate([np.stack([*(fits.depth[:, None] * slope for slope in by), value], axis=1), surface], axis=1)
+    weight = windows.valid / noise.variance_at(fits.depth[:, None] * value + windows.added)
+    under = np.hypot(cols - local[:, :1], rows - local[:, 1:]) < rim[:, None]
+    target, held = _hold(fits, common)
+    precision = np.zeros(images.shape[:2])
+    precision[:, 2] = held
+    data = windows.data - fits.depth[:, None] * (value + (target - fits.radius_px)[:, None] * by[2])
+    some, valid = np.flatnonzero(fits.chi2_ring > _UNEVEN), windows.valid.copy()
+    residual = robust_residual(images[some], data[some], weight[some], precision[some])
+    found = foreign(residual, weight[some], (windows.valid & ~under)[some], float(noise.gain(np.array(1.0))))
+    valid[some] &= ~found & ~in_line(found, local[some], rim[some])
+    return replace(
+        windows, valid=valid, covered=(windows.valid & ~valid & under).sum(axis=1) / np.maximum((windows.valid & under).sum(axis=1), 1)
     )
 
 
@@ -187,7 +223,7 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
     target, held = _hold(fits, common)
     precision = np.zeros((len(depth), 4 + len(surface)))
     precision[:, 2], precision[:, _PER_BALL:] = held, _precision(known, structure, fits, noise)
-    each, valid = np.arange(precision.shape[1]), windows.valid
+    each = np.arange(precision.shape[1])
     for step in range(_STEPS):
         shapes = slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, sigma_px)
         value, *by = (shape.astype(np.float64) for shape in shapes)
@@ -198,7 +234,7 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         curves[:, 0] = surface[0]
         images = np.concatenate([np.stack([-depth[:, None] * by[0], -depth[:, None] * by[1], depth[:, None] * by[2], value], 1), curves], 1)
         left = windows.data - ball
-        weight = valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
+        weight = windows.valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
         weighted = images * weight[:, None]
         normal, right = np.matmul(weighted, images.swapaxes(1, 2)), np.matmul(weighted, left[:, :, None])[:, :, 0]
         if step == 1:  # once the background is known roughly
@@ -214,9 +250,6 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
         residual = left - np.matmul(change[:, None], images)[:, 0]
-        if step + 1 < _STEPS:
-            outside = np.hypot(cols - local[:, :1], rows - local[:, 1:]) > (radius + sigma_px)[:, None]
-            valid = windows.valid & ~_foreign(residual, weight, windows.valid & outside)
     return _Solution(local, radius, images, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure)
 
 
@@ -238,7 +271,7 @@ def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) ->
     distance = np.hypot(cols - found.local_px[:, :1], rows - found.local_px[:, 1:])
     core = distance < (found.radius_px + common.optics.sigma_px)[:, None]
     under, ring = (uneven(found.residual, found.weight, found.local_px, side, where) for where in (core, ~core))
-    left = (found.weight * found.residual**2 * core).sum(axis=1) / np.maximum((core & windows.valid).sum(axis=1), 1)
+    left = (found.weight * found.residual**2 * core).sum(axis=1) / np.maximum((core & (found.weight > 0)).sum(axis=1), 1)
     position = found.local_px + windows.corner_px
     return replace(fits, position_px=position, covariance=covariance, chi2_core=left, chi2_uneven=under, chi2_ring=ring)
 
@@ -246,15 +279,6 @@ def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) ->
 def _precision(known: Modes, structure: Float, fits: BallFits, noise: NoiseModel) -> Float:
     # correlated noise makes a fit surer than it is: held in the same proportion, surfaces bend as far as they should
     return np.asarray(1 / (np.maximum(structure[:, known.degree], _NONE) * noise.variance_at(fits.background)[:, None]))
-
-
-def _foreign(residual: Float, weight: Float, where: Bool) -> Bool:
-    """Say which pixels around balls belong to other things: wires, dust, scratches. Where it is much, the background itself is another."""
-    off = np.abs(residual) * np.sqrt(weight)
-    usual = np.array([np.median(row[here]) if here.any() else 0.0 for row, here in zip(off, where & (weight > 0), strict=True)])
-    found = where & (off > _FAR * np.maximum(1.0, SD_OF_MAD * usual)[:, None])
-    little = found.sum(axis=1) < _MOST_FOREIGN * where.sum(axis=1)
-    return np.asarray(found & little[:, None])
 
 
 def _own_share(normal: Float, right: Float, precision: Float, gain: Float, differ: float) -> Float:
