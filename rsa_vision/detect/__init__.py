@@ -177,20 +177,21 @@ def _one_polarity(
                 total += needle_image(dx, dy, t, seen).reshape(cols.shape)
         return total
 
-    balls, touching, edged = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
+    balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
-    balls, touching, edged = balls.rows(keep), touching[keep], edged[keep]
+    balls, touching, edged, drawn = balls.rows(keep), touching[keep], edged[keep], drawn[keep]
     more = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needle_images if needles else None)
     both = join([balls, more])
     like = are_balls(both, limit, optics.sigma_px, noise)[len(balls.depth) :]
     more = more.rows(like & (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins))
-    balls, (touching, edged) = join([balls, more]), (np.append(known, np.zeros(len(more.depth), bool)) for known in (touching, edged))
+    added = np.zeros(len(more.depth), bool)
+    balls, (touching, edged, drawn) = join([balls, more]), (np.append(known, added) for known in (touching, edged, drawn))
     for fit in doubtful:
         if found := part(film, fit, balls, optics, tee_optics, noise, needle_images, is_tee):
             tee, ball = found
             apart = np.hypot(*(balls.position_px - ball.position_px[0]).T) > ball.radius_px[0]
             balls = join([balls.rows(apart), ball])
-            touching, edged = np.append(touching[apart], True), np.append(edged[apart], False)
+            touching, edged, drawn = np.append(touching[apart], True), np.append(edged[apart], False), np.append(drawn[apart], False)
             tees = [*tees, tee]
 
     def beside(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
@@ -201,9 +202,9 @@ def _one_polarity(
     place = np.array([t.position_px for t in others]).reshape(-1, 2)
     reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
     places = free_places(film, balls, place, reach, optics, noise)
-    clear = balls.rows(~touching & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
+    clear = balls.rows(~touching & ~drawn & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
     under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
-    balls, ratio = settle(film, balls, places, under, ~touching, edged, beside, optics, noise)
+    balls, ratio = settle(film, balls, places, under, ~touching & ~drawn, edged, beside, optics, noise)
     images = _table(film, bits, balls, under, ratio, touching, others, optics, noise)
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
