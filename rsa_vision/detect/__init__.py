@@ -34,6 +34,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 __all__ = ["Detection", "detect_markers"]
 
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
+EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE = 0.999  # part of the pixels under a ball
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
@@ -287,6 +288,7 @@ def _table(
     # whatever lies around it, what was found of a ball lies under its image: evenly spread over a disc at worst
     most = 0.25 * (balls.radius_px + optics.sigma_px) ** 2
     covariance[:n] *= np.minimum(1.0, most / np.linalg.eigvalsh(covariance[:n])[:, -1])[:, None, None]
+    covariance[:n] += EXACT_PX**2 * np.eye(2)
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
