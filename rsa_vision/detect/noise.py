@@ -20,7 +20,7 @@ STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, 
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
 _MOST_LOOKED_AT = 1500**2  # pixels that tell whether a film is saturated
-_EVEN, _MUCH = 0.9, 0.2  # part of a background without noise that lies beside its like, part of the film
+_MUCH, _SPECKS = 0.2, 0.2  # part of a film that its background is, part of the runs of pixels in it that are one pixel long
 _ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many times as many as there are within the fourth of such
 _TAIL = 16  # such distances are less than this part of the values
 _LEVELS = 12  # value classes of the variance curve
@@ -106,8 +106,9 @@ def _is_saturated(sample: NDArray[Any], edge: int, inward: int, limit: bool) -> 
         return False
     if not limit and count <= 5 * max(1, *(int(np.count_nonzero(sample == edge + inward * k)) for k in range(1, 6))):
         return False
-    # noise makes no areas of one value; of a tail there are as many pixels at a distance as are inverse to it
-    if count < _MUCH * sample.size or np.count_nonzero(there[:, 1:] & there[:, :-1]) < _EVEN * count:
+    # noise makes specks in areas of one value; of a tail there are as many pixels at a distance as are inverse to it
+    specks = np.count_nonzero(there[:, :-2] & ~there[:, 1:-1] & there[:, 2:])
+    if count < _MUCH * sample.size or specks > _SPECKS * np.count_nonzero(there[:, :-1] & ~there[:, 1:]):
         return True
     distance = np.sort((sample[~there].astype(np.int64) - edge) * inward)
     if len(distance) == 0:
@@ -158,7 +159,7 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         curve.append(float(np.median(variance[chosen])))
         quiet.append(chosen)
     ranked = np.argsort(level)
-    level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.array(curve)[ranked])
+    level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], _QUANTISATION))
     clean = curve_array >= np.array(curve)[ranked] * 0.999
     chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])
     noisy = chosen[variance[chosen] > _ROUNDED * _QUANTISATION]  # areas of one value say nothing of neighbours
