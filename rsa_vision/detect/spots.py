@@ -25,14 +25,14 @@ from rsa_vision.types import Bool, Float
 
 ODD = 0.6  # of the misfit that a ball may leave
 COMPANY = 6  # odd ones that one spot has to explain: twice what it has parameters, less one
-_MOST = 20
+_MOST = 12  # that tell the spot roughly
 _EXPLAINED = 0.85
 LEAST_KNOWN = 3  # balls that tell what one of them looks like on this film
 _FAINT = 0.25  # of the depth of those, or of the sixth deepest: bone
 _LIKE = 1.25  # ratio of radii
 _REACH = 0.8  # of the radius: what is spread farther is no ball with a spot, but a rod or a pair
 _STARTS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
-_STEPS, _LAST_STEPS = 8, 12
+_STEPS, _LAST_STEPS = 6, 12
 _H = 0.02  # pixels, for derivatives by the spot
 _MOST_STEP_PX = 0.6
 _SHRINK = 0.9  # of the radius, which has taken some of the spread
@@ -120,17 +120,17 @@ def find_spot(
     if like.sum(axis=1).max(initial=0) < COMPANY:
         return none, None
     odd = odd.rows(like[like.sum(axis=1).argmax()])
-    odd = odd.rows(np.argsort(-over_clutter(odd))[:_MOST])
+    odd = odd.rows(np.argsort(-over_clutter(odd)))
     radius = float(np.median(odd.radius_px))
     half = half_size(radius, optics.sigma_px)
-    window = _window(film, odd, half, others, noise)
+    few = _window(film, odd.rows(slice(_MOST)), half, others, noise)
     trials = []
     for angle in _STARTS:
         along = np.array([0.4 * radius * np.cos(angle), 0.4 * radius * np.sin(angle), 0.2 * radius, 0.0])
-        start = _State(along, odd.position_px - window.corner, _SHRINK * odd.radius_px, np.zeros((len(odd.depth), 7)))
-        trials.append(_fitted(window, start, _STEPS, optics, noise, radius))
-    state, left = min(trials, key=lambda trial: float(np.log(trial[1]).sum()))
-    state, _ = _fitted(window, state, _LAST_STEPS, optics, noise, radius)
+        trials.append(_fitted(few, _start(odd.rows(slice(_MOST)), few, along), _STEPS, optics, noise, radius))
+    best, _ = min(trials, key=lambda trial: float(np.log(trial[1]).sum()))
+    window = _window(film, odd, half, others, noise)
+    state, _ = _fitted(window, _start(odd, window, best.along), _LAST_STEPS, optics, noise, radius)
     fits = _table(window, state, odd, optics, noise)
     rest, before = misfit(fits, noise), misfit(odd, noise)
     alike = np.abs(np.log(fits.radius_px / np.median(fits.radius_px))) < np.log(_LIKE)  # others are at another height
@@ -148,6 +148,10 @@ class _Window:
     cols: Float  # (p,)
     rows: Float
     surface: Float  # (6, p)
+
+
+def _start(odd: BallFits, window: _Window, along: Float) -> _State:
+    return _State(along, odd.position_px - window.corner, _SHRINK * odd.radius_px, np.zeros((len(odd.depth), 7)))
 
 
 def _window(film: NDArray[Any], balls: BallFits, half: int, others: Any, noise: NoiseModel) -> _Window:
