@@ -23,6 +23,10 @@ _MOST_LOOKED_AT = 1500**2  # pixels that tell whether a film is saturated
 _MUCH, _SPECKS = 0.2, 0.2  # part of a film that its background is, part of the runs of pixels in it that are one pixel long
 _ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many times as many as there are within the fourth of such
 _TAIL = 16  # such distances are less than this part of the values
+BLOCK = 8  # pixels
+_MOST_FOR_BLOCKS = 400_000  # pixels that tell whether a film was compressed in blocks
+_LARGEST_STEP = 8.0  # times the usual one
+_BLOCKY = 1.15  # times as much: chance makes hundredths
 _LEVELS = 12  # value classes of the variance curve
 _QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
 _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
@@ -168,7 +172,37 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
-    return NoiseModel(level_array, np.maximum(curve_array / bias, max(_QUANTISATION, least)), correlation, floor, ceiling)
+    variance = np.maximum(curve_array / bias, max(_QUANTISATION, least)) + block_variance(film)
+    return NoiseModel(level_array, variance, correlation, floor, ceiling)
+
+
+def _lag_zero() -> Float:
+    """Return the correlation of white noise."""
+    return np.outer(*[np.arange(-LAGS, LAGS + 1) == 0] * 2).astype(np.float64)
+
+
+def block_variance(film: NDArray[Any]) -> float:
+    """Return the variance that compression in blocks (JPEG) adds to a pixel, by how much more neighbours differ across their borders.
+
+    Such a compression rounds away the noise of quiet tiles, and puts errors in the place of what it rounds where marks are.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+
+    Returns
+    -------
+    float
+        0 where no border of blocks shows.
+    """
+    sample = film[:: max(1, film.size // _MOST_FOR_BLOCKS)].astype(np.int32)
+    step = np.abs(np.diff(sample, axis=1))
+    if step.shape[1] < 2 * BLOCK:
+        return 0.0
+    step = np.minimum(step, max(1, int(_LARGEST_STEP * step.mean())))  # of edges all borders have their share
+    square = np.square(step[:, : step.shape[1] // BLOCK * BLOCK]).reshape(-1, BLOCK).mean(axis=0)
+    inside = float(np.median(square))
+    return 0.5 * (float(square.max()) - inside) if square.max() > _BLOCKY * inside else 0.0
 
 
 def medians(values: NDArray[Any]) -> NDArray[Any]:
@@ -205,7 +239,7 @@ def _tiles(film: NDArray[Any], side: int) -> NDArray[Any]:
 def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
     side = round(np.sqrt(rest.shape[1]))
     if len(rest) == 0:
-        return _smooth_correlation(np.eye(2 * LAGS + 1)[LAGS] * np.eye(2 * LAGS + 1)[LAGS][:, None])
+        return _lag_zero(), 0.0
     tiles = (rest / np.sqrt(np.maximum(variance, 1e-12))[:, None]).reshape(-1, side, side)
     size = 2 * side
     spectrum = np.abs(np.fft.rfft2(tiles, s=(size, size))) ** 2
@@ -214,7 +248,7 @@ def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
     pairs = (side - np.abs(lag))[:, None] * (side - np.abs(lag))[None, :]
     auto = sums[np.ix_(lag % size, lag % size)] / pairs
     centre = auto[LAGS, LAGS]
-    auto = auto / centre if centre > 0 else (lag[:, None] == 0) * (lag[None, :] == 0) * 1.0
+    auto = auto / centre if centre > 0 else _lag_zero()
     return _smooth_correlation(auto)
 
 
