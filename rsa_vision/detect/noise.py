@@ -172,13 +172,17 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
-    variance = np.maximum(curve_array / bias, max(_QUANTISATION, least)) + block_variance(film)
-    return NoiseModel(level_array, variance, correlation, floor, ceiling)
+    variance, blocks = np.maximum(curve_array / bias, max(_QUANTISATION, least)), block_variance(film)
+    if blocks:  # whose errors are as good as white
+        usual = float(np.median(variance))
+        correlation = (usual * correlation + blocks * _lag_zero()) / (usual + blocks)
+    return NoiseModel(level_array, variance + blocks, correlation, floor, ceiling)
 
 
 def _lag_zero() -> Float:
     """Return the correlation of white noise."""
-    return np.outer(*[np.arange(-LAGS, LAGS + 1) == 0] * 2).astype(np.float64)
+    at_zero = (np.arange(-LAGS, LAGS + 1) == 0).astype(np.float64)
+    return np.asarray(np.outer(at_zero, at_zero))
 
 
 def block_variance(film: NDArray[Any]) -> float:

@@ -72,8 +72,9 @@ def resolve_balls(
         Fitted with the film's focal spot.
     """
     if len(seeds.depth) == 0:
-        return seeds, *[np.zeros(0, bool)] * 3
-    others = None if tees is None else lambda _i, cols, rows: (tees(cols, rows), np.zeros(cols.shape, bool))
+        return seeds, np.zeros(0, bool), np.zeros(0, bool), np.zeros(0, bool)
+    needles = tees
+    others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     like_balls = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
     clear = single.rows(like_balls & look_clear(single, noise))
@@ -87,8 +88,8 @@ def resolve_balls(
         return [g for g in _groups(good, optics) if worth[g].any()]
 
     groups, fits = groups_worth_fitting(), []
-    clear = look_clear(good, noise)
-    like = good.rows(clear) if np.count_nonzero(clear) >= LEAST_KNOWN else good
+    known_well = look_clear(good, noise)
+    like = good.rows(known_well) if np.count_nonzero(known_well) >= LEAST_KNOWN else good
     for members in _unexplained_pairs(film, candidates, good, like, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, like)))

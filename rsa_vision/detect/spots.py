@@ -1,9 +1,9 @@
 """Balls drawn by a focal spot that is no Gaussian: what the odd images of a film have in common is its spot.
 
 Far above the film a ball's image is spread by the focal spot, times the magnification less one: by two ridges 5 pixels apart, where that
-of a mark near the film is sharp. No blurred ball looks like that. A spot, as far as balls let it be seen, is two peaks of different weights,
-each a pair across: four points, which also have the second and fourth moments of squares and discs. All images of the spot on marks of
-one height are the same. So what single odd things look like excuses none of them: only what one spot explains of many is a ball.
+of a mark near the film is sharp. No blurred ball looks like that. A spot, as far as balls let it be seen, is two peaks of different
+weights, each a pair across: four points, which stand for squares and discs as well. All images of the spot on marks of one height are the
+same. So what single odd things look like excuses none of them: only what one spot explains of many is a ball.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ LEAST_KNOWN = 3  # balls that tell what one of them looks like on this film
 _FAINT = 0.25  # of the depth of those, or of the sixth deepest: bone
 _LIKE = 1.25  # ratio of radii
 _REACH = 0.8  # of the radius: what is spread farther is no ball with a spot, but a rod or a pair
+_ACROSS = 0.25  # of the distance along: two points without extent across are pairs of balls, no spot
 _STARTS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
 _STEPS, _LAST_STEPS = 6, 12
 _H = 0.02  # pixels, for derivatives by the spot
@@ -108,7 +109,13 @@ def find_spot(
     spot : Spot or None
     """
     none = odd.rows(slice(0))
-    worth = (odd.explained > _EXPLAINED) & (over_clutter(odd) > SURE) & (odd.valid_fraction > 0.95) & (odd.window_fraction > 0.5) & (odd.radius_px < RADIUS_PX[1])
+    worth = (
+        (odd.explained > _EXPLAINED)
+        & (over_clutter(odd) > SURE)
+        & (odd.valid_fraction > 0.95)
+        & (odd.window_fraction > 0.5)
+        & (odd.radius_px < RADIUS_PX[1])
+    )
     odd = odd.rows(worth)
     # tantalum, not bone, and those with most company of their size
     if len(odd.depth) < COMPANY:
@@ -131,6 +138,8 @@ def find_spot(
     best, _ = min(trials, key=lambda trial: float(np.log(trial[1]).sum()))
     window = _window(film, odd, half, others, noise)
     state, _ = _fitted(window, _start(odd, window, best.along), _LAST_STEPS, optics, noise, radius)
+    if state.along[2] ** 2 < (_ACROSS * np.hypot(*state.along[:2])) ** 2:
+        return none, None
     fits = _table(window, state, odd, optics, noise)
     rest, before = misfit(fits, noise), misfit(odd, noise)
     alike = np.abs(np.log(fits.radius_px / np.median(fits.radius_px))) < np.log(_LIKE)  # others are at another height
