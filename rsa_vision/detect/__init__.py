@@ -35,6 +35,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 __all__ = ["Detection", "detect_markers"]
 
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
+EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE = 0.999  # part of the pixels under a ball
 POOR = 0.6  # of the misfit that a ball may leave
 BENT = 1.5  # the same once an edge or bending surfaces around it could have taken it up
@@ -180,20 +181,21 @@ def _one_polarity(
                 total += needle_image(dx, dy, t, seen).reshape(cols.shape)
         return total
 
-    balls, touching, edged = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
+    balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
-    balls, touching, edged = balls.rows(keep), touching[keep], edged[keep]
+    balls, touching, edged, drawn = balls.rows(keep), touching[keep], edged[keep], drawn[keep]
     more = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needle_images if needles else None)
     both = join([balls, more])
     like = are_balls(both, limit, optics.sigma_px, noise)[len(balls.depth) :]
     more = more.rows(like & (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins))
-    balls, (touching, edged) = join([balls, more]), (np.append(known, np.zeros(len(more.depth), bool)) for known in (touching, edged))
+    added = np.zeros(len(more.depth), bool)
+    balls, (touching, edged, drawn) = join([balls, more]), (np.append(known, added) for known in (touching, edged, drawn))
     for fit in doubtful:
         if found := part(film, fit, balls, optics, tee_optics, noise, needle_images, is_tee):
             tee, ball = found
             apart = np.hypot(*(balls.position_px - ball.position_px[0]).T) > ball.radius_px[0]
             balls = join([balls.rows(apart), ball])
-            touching, edged = np.append(touching[apart], True), np.append(edged[apart], False)
+            touching, edged, drawn = np.append(touching[apart], True), np.append(edged[apart], False), np.append(drawn[apart], False)
             tees = [*tees, tee]
 
     def beside(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
@@ -204,9 +206,9 @@ def _one_polarity(
     place = np.array([t.position_px for t in others]).reshape(-1, 2)
     reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
     places = free_places(film, balls, place, reach, optics, noise)
-    clear = balls.rows(~touching & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
+    clear = balls.rows(~touching & ~drawn & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
     under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
-    balls, ratio = settle(film, balls, places, under, ~touching, edged, beside, optics, noise)
+    balls, ratio = settle(film, balls, places, under, ~touching & ~drawn, edged, beside, optics, noise)
     left, poor = _what_is_left(balls, under, noise)
     keep = left < BENT * MISFIT
     keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
@@ -299,6 +301,7 @@ def _table(
     # whatever lies around it, what was found of a ball lies under its image: evenly spread over a disc at worst
     most = 0.25 * (balls.radius_px + optics.sigma_px) ** 2
     covariance[:n] *= np.minimum(1.0, most / np.linalg.eigvalsh(covariance[:n])[:, -1])[:, None, None]
+    covariance[:n] += EXACT_PX**2 * np.eye(2)
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))

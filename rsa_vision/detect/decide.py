@@ -82,13 +82,13 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     # what would be larger still than the fit may go is no ball of that size
     sure = (strength > max(SURE, limit)) & ~spot & (fits.radius_px < RADIUS_PX[1])
     close = misfit(fits, noise) < MISFIT
-    pattern = sure & close & (fits.explained > CLOSE)
+    height = _height(fits, sigma_px)
+    pattern = _not_faint(sure & close & (fits.explained > CLOSE), height)
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < _LEAST_PATTERNS:
         # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
         company = _of_like_spread(_spread(fits, sigma_px), sure) >= _COMPANY
         return np.asarray(sure & (company | (close & (strength > ALONE))))
-    height = _height(fits, sigma_px)
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
     least = np.where(close, FAINT, UNEXCUSED)
@@ -99,6 +99,14 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
     return np.asarray((fits.significance > limit) & alike & (sure | (strength > 0.5 * SURE)))
+
+
+def _not_faint(pattern: Bool, height: Float) -> Bool:
+    """Take from patterns what is faint: a crowd of that, as edges make it on a film without noise, does not say what is usual."""
+    ranked = np.sort(height[pattern])
+    total = np.cumsum(ranked)
+    usual = ranked[np.searchsorted(total, 0.5 * total[-1])] if len(ranked) else 0.0
+    return np.asarray(pattern & (height > FAINT * usual))
 
 
 def _spread(fits: BallFits, sigma_px: float) -> Float:

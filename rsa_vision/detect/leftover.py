@@ -14,6 +14,7 @@ _FITTED = 4  # parameters that ``uneven`` counts off
 _AT_RIM = 0.7  # the rim, which tells the centre, lies at half the depth; the mean of all that is under a ball at seven tenths
 _OUTLIER = 3.0  # times the median
 _LEAST = 8  # balls, and places, that tell something
+_NOTHING = 0.01  # places leave less only where there is no noise
 _MOST = 0.4, 2.5  # what they may tell
 
 
@@ -45,11 +46,12 @@ def noise_under(uneven: Float, radius_px: Float, quiet: float, places: list[Plac
     beside = np.concatenate([np.zeros(0), *left])
     if len(beside) < _LEAST:
         return 1.0
-    return float(np.clip((_usual(uneven) / _usual(beside)) ** _AT_RIM, *_MOST))
+    usual = _usual(beside)
+    return float(np.clip((_usual(uneven) / usual) ** _AT_RIM, *_MOST)) if usual > _NOTHING else 1.0
 
 
 def _usual(squares: Float) -> float:
-    return float(squares[squares < _OUTLIER * np.median(squares)].mean())
+    return float(squares[squares <= _OUTLIER * np.median(squares)].mean())
 
 
 def _uneven(places: Places, radius_px: float, quiet: float, optics: Optics, noise: NoiseModel) -> Float:

@@ -20,8 +20,17 @@ STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, 
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
 _MOST_LOOKED_AT = 1500**2  # pixels that tell whether a film is saturated
+_MUCH, _SPECKS = 0.2, 0.2  # part of a film that its background is, part of the runs of pixels in it that are one pixel long
+_ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many times as many as there are within the fourth of such
+_TAIL = 16  # such distances are less than this part of the values
+BLOCK = 8  # pixels
+_MOST_FOR_BLOCKS = 400_000  # pixels that tell whether a film was compressed in blocks
+_LARGEST_STEP = 8.0  # times the usual one
+_BLOCKY = 1.15  # times as much: chance makes hundredths
 _LEVELS = 12  # value classes of the variance curve
 _QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
+_NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
+_ROUNDED = 0.1  # of that: less is left by no noise
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
 
 
@@ -72,7 +81,9 @@ class NoiseModel:
 def saturation(film: NDArray[Any], bits: int) -> tuple[float, float]:
     """Return the values at and beyond which pixels are saturated.
 
-    A limit of the value range counts as saturation only where a crowd of pixels piles up on it: more than on the values beside it.
+    A limit of the value range counts as saturation only where a crowd of pixels piles up on it: more than on the values beside it. So do
+    the pixels of the background of a film without noise. What is cut off goes on beside it as steeply as before; into such a background the
+    images of marks fade out: the nearer to it, the more pixels have a value.
 
     Parameters
     ----------
@@ -87,19 +98,29 @@ def saturation(film: NDArray[Any], bits: int) -> tuple[float, float]:
     """
     sample = film[:: max(1, film.size // _MOST_LOOKED_AT)]  # whole rows, as they lie in memory
     low, high = int(sample.min()), int(sample.max())
-    crowd = max(20, sample.size // 20000)
-    full = 2**bits - 1
-    floor, ceiling = -np.inf, np.inf
-    if np.count_nonzero(sample == high) > crowd and (high >= full or _piles_up(sample, high, -1)):
-        ceiling = float(high)
-    if np.count_nonzero(sample == low) > crowd and (low == 0 or _piles_up(sample, low, 1)):
-        floor = float(low)
+    floor = float(low) if _is_saturated(sample, low, 1, low == 0) else -np.inf
+    ceiling = float(high) if _is_saturated(sample, high, -1, high >= 2**bits - 1) else np.inf
     return floor, ceiling
 
 
-def _piles_up(sample: NDArray[Any], edge: int, inward: int) -> bool:
-    neighbours = [int(np.count_nonzero(sample == edge + inward * k)) for k in range(1, 6)]
-    return bool(np.count_nonzero(sample == edge) > 5 * max(1, *neighbours))
+def _is_saturated(sample: NDArray[Any], edge: int, inward: int, limit: bool) -> bool:
+    there = sample == edge
+    count = int(np.count_nonzero(there))
+    if count <= max(20, sample.size // 20000):
+        return False
+    if not limit and count <= 5 * max(1, *(int(np.count_nonzero(sample == edge + inward * k)) for k in range(1, 6))):
+        return False
+    # noise makes specks in areas of one value; of a tail there are as many pixels at a distance as are inverse to it
+    specks = np.count_nonzero(there[:, :-2] & ~there[:, 1:-1] & there[:, 2:])
+    if count < _MUCH * sample.size or specks > _SPECKS * np.count_nonzero(there[:, :-1] & ~there[:, 1:]):
+        return True
+    distance = np.sort((sample[~there].astype(np.int64) - edge) * inward)
+    if len(distance) == 0:
+        return True
+    reach = 2 ** np.arange(max(1, int(np.log2(distance[-1] / _TAIL)) + 1))
+    near, third, far = (np.searchsorted(distance, k * reach, side="right") for k in (1, 3, 4))
+    counted = near >= _ENOUGH
+    return bool(not counted.any() or (near < _FADES * (far - third))[counted].any())
 
 
 def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
@@ -142,13 +163,50 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         curve.append(float(np.median(variance[chosen])))
         quiet.append(chosen)
     ranked = np.argsort(level)
-    level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.array(curve)[ranked])
+    level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], _QUANTISATION))
     clean = curve_array >= np.array(curve)[ranked] * 0.999
     chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])
-    correlation, hidden = _correlation(rest[chosen], variance[chosen])
+    noisy = chosen[variance[chosen] > _ROUNDED * _QUANTISATION]  # areas of one value say nothing of neighbours
+    correlation, hidden = _correlation(rest[noisy], variance[noisy])
     independent = dof / max(float((correlation**2).sum()), 1.0)
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
-    return NoiseModel(level_array, np.maximum(curve_array / bias, _QUANTISATION), correlation, floor, ceiling)
+    # a film without noise is one that was calculated: no more exact than that
+    least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
+    variance, blocks = np.maximum(curve_array / bias, max(_QUANTISATION, least)), block_variance(film)
+    if blocks:  # whose errors are as good as white
+        usual = float(np.median(variance))
+        correlation = (usual * correlation + blocks * _lag_zero()) / (usual + blocks)
+    return NoiseModel(level_array, variance + blocks, correlation, floor, ceiling)
+
+
+def _lag_zero() -> Float:
+    """Return the correlation of white noise."""
+    at_zero = (np.arange(-LAGS, LAGS + 1) == 0).astype(np.float64)
+    return np.asarray(np.outer(at_zero, at_zero))
+
+
+def block_variance(film: NDArray[Any]) -> float:
+    """Return the variance that compression in blocks (JPEG) adds to a pixel, by how much more neighbours differ across their borders.
+
+    Such a compression rounds away the noise of quiet tiles, and puts errors in the place of what it rounds where marks are.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+
+    Returns
+    -------
+    float
+        0 where no border of blocks shows.
+    """
+    sample = film[:: max(1, film.size // _MOST_FOR_BLOCKS)].astype(np.int32)
+    step = np.abs(np.diff(sample, axis=1))
+    if step.shape[1] < 2 * BLOCK:
+        return 0.0
+    step = np.minimum(step, max(1, int(_LARGEST_STEP * step.mean())))  # of edges all borders have their share
+    square = np.square(step[:, : step.shape[1] // BLOCK * BLOCK]).reshape(-1, BLOCK).mean(axis=0)
+    inside = float(np.median(square))
+    return 0.5 * (float(square.max()) - inside) if square.max() > _BLOCKY * inside else 0.0
 
 
 def medians(values: NDArray[Any]) -> NDArray[Any]:
@@ -184,6 +242,8 @@ def _tiles(film: NDArray[Any], side: int) -> NDArray[Any]:
 
 def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
     side = round(np.sqrt(rest.shape[1]))
+    if len(rest) == 0:
+        return _lag_zero(), 0.0
     tiles = (rest / np.sqrt(np.maximum(variance, 1e-12))[:, None]).reshape(-1, side, side)
     size = 2 * side
     spectrum = np.abs(np.fft.rfft2(tiles, s=(size, size))) ** 2
@@ -192,7 +252,7 @@ def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
     pairs = (side - np.abs(lag))[:, None] * (side - np.abs(lag))[None, :]
     auto = sums[np.ix_(lag % size, lag % size)] / pairs
     centre = auto[LAGS, LAGS]
-    auto = auto / centre if centre > 0 else (lag[:, None] == 0) * (lag[None, :] == 0) * 1.0
+    auto = auto / centre if centre > 0 else _lag_zero()
     return _smooth_correlation(auto)
 
 

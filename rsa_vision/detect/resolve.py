@@ -19,6 +19,7 @@ from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible, 
 from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.spots import LEAST_KNOWN, find_spot, with_spot
 from rsa_vision.types import Bool, Float, Int
 
 Background = Callable[[Float, Float], Float]
@@ -30,7 +31,6 @@ DOUBTFUL = 0.6  # of the misfit that a ball may leave: more may be two balls
 OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added to the stated variance
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
 _FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
-_LEAST_KNOWN = 3  # balls that tell what one of them looks like on this film
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
@@ -43,7 +43,7 @@ def resolve_balls(
     optics: Optics,
     noise: NoiseModel,
     tees: Background | None,
-) -> tuple[BallFits, Bool, Bool]:
+) -> tuple[BallFits, Bool, Bool, Bool]:
     """Fit all balls of a film.
 
     Parameters
@@ -68,11 +68,19 @@ def resolve_balls(
         Fitted together with a neighbour.
     edged : ndarray of bool, shape (n,)
         Fitted together with an edge.
+    drawn : ndarray of bool, shape (n,)
+        Fitted with the film's focal spot.
     """
     if len(seeds.depth) == 0:
-        return seeds, np.zeros(0, bool), np.zeros(0, bool)
-    others = None if tees is None else lambda _i, cols, rows: (tees(cols, rows), np.zeros(cols.shape, bool))
+        return seeds, np.zeros(0, bool), np.zeros(0, bool), np.zeros(0, bool)
+    needles = tees
+    others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
+    like_balls = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
+    clear = single.rows(like_balls & look_clear(single, noise))
+    drawn, spot = find_spot(film, single.rows(~like_balls), clear, optics, noise, others)
+    if spot is not None:
+        single, tees = single.rows(~_taken(single, drawn)), with_spot(tees, drawn, spot, optics)
     good = single.rows(plausible(single, noise, slack=1.5))
 
     def groups_worth_fitting() -> list[list[int]]:
@@ -80,8 +88,8 @@ def resolve_balls(
         return [g for g in _groups(good, optics) if worth[g].any()]
 
     groups, fits = groups_worth_fitting(), []
-    clear = look_clear(good, noise)
-    like = good.rows(clear) if np.count_nonzero(clear) >= _LEAST_KNOWN else good
+    known_well = look_clear(good, noise)
+    like = good.rows(known_well) if np.count_nonzero(known_well) >= LEAST_KNOWN else good
     for members in _unexplained_pairs(film, candidates, good, like, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, like)))
@@ -110,17 +118,17 @@ def resolve_balls(
             return images_beside(known, alone[[i]], optics, tees, cols, rows)
 
         fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
-    if not fits:
-        return single.rows(slice(0)), np.zeros(0, bool), np.zeros(0, bool)
-    found = join(fits)
+    found = join([single.rows(slice(0)), *fits])
     found = found.rows(plausible(found, noise) & inside(found, film))
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
-    found, edged = _beside_edges(film, distinct(found, noise), optics, noise, tees)
+    found, edged = _beside_edges(film, distinct(found.rows(~_taken(found, drawn)), noise), optics, noise, tees)
+    by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)
+    found, edged = join([found, drawn]), np.append(edged, np.zeros(len(drawn.depth), bool))
     near = [len(g) > 1 for g in _groups(found, optics)]
     touching = np.zeros(len(found.depth), bool)
     for g, several in zip(_groups(found, optics), near, strict=True):
         touching[g] = several
-    return found, touching, edged
+    return found, touching, edged, by_spot
 
 
 def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> tuple[BallFits, Bool]:
@@ -171,9 +179,9 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
     ndarray of bool, shape (n,)
         None where fewer than three are known.
     """
-    if len(known.depth) < _LEAST_KNOWN:
+    if len(known.depth) < LEAST_KNOWN:
         return np.zeros(len(fits.depth), bool)
-    known = known.rows(np.argsort(known.chi2_core)[: max(_LEAST_KNOWN, len(known.depth) // 4)])  # the others may be two themselves
+    known = known.rows(np.argsort(known.chi2_core)[: max(LEAST_KNOWN, len(known.depth) // 4)])  # the others may be two themselves
     left = misfit(fits, noise)
     unlike = (
         (left > _UNLIKE * np.median(misfit(known, noise))) & (left > _LEAST_UNLIKE) & (fits.chi2_core > 1 + 5 * noise.scatter(fits.n_core))

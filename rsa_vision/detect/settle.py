@@ -21,11 +21,11 @@ from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, slopes, uneven
 from rsa_vision.detect.decide import EDGE
 from rsa_vision.detect.find import CHANCE
+from rsa_vision.detect.foreign import foreign, in_line, robust_residual
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.resolve import OF_SHIFT
-from rsa_vision.detect.foreign import foreign, in_line, robust_residual
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import Proportion, Size, proportion, usual_size
 from rsa_vision.types import Bool, Float, Int
