@@ -18,7 +18,6 @@ from rsa_vision.detect.decide import hopeless, look_clear
 from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
 
@@ -43,7 +42,7 @@ def resolve_balls(
     limit: float,
     optics: Optics,
     noise: NoiseModel,
-    tees: Painted | None,
+    tees: Background | None,
 ) -> tuple[BallFits, Bool, Bool]:
     """Fit all balls of a film.
 
@@ -58,7 +57,7 @@ def resolve_balls(
         Significance that a mark must have.
     optics : Optics
     noise : NoiseModel
-    tees : Painted, optional
+    tees : callable, optional
         Images of pins and tees, to be subtracted.
 
     Returns
@@ -70,8 +69,6 @@ def resolve_balls(
     edged : ndarray of bool, shape (n,)
         Fitted together with an edge.
     """
-    if tees is not None:
-        seeds = seeds.rows(~tees.explain(film, seeds.position_px, seeds.radius_px))
     if len(seeds.depth) == 0:
         return seeds, np.zeros(0, bool), np.zeros(0, bool)
     others = None if tees is None else lambda _i, cols, rows: (tees(cols, rows), np.zeros(cols.shape, bool))
