@@ -18,9 +18,10 @@ from rsa_vision.detect.decide import EDGE, are_balls
 from rsa_vision.detect.find import CHANCE, MISFIT, ROUNDNESS, STRENGTH, distinct, first_look, fit_at, misfit, plausible, significance_limit
 from rsa_vision.detect.leftover import noise_under
 from rsa_vision.detect.mixed import part
-from rsa_vision.detect.needle_images import NeedleFit, needle_image
+from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import ball_evidence, estimate_optics
+from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import images_beside, resolve_balls
@@ -169,29 +170,19 @@ def _one_polarity(
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]
     pins, pin_optics = find_pins(film, [p for p in rough_pins if np.sign(p.depth) == sign], tees, optics, noise)
 
-    needles = [(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]
+    needles = paint(film.shape, [(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
 
-    def needle_images(cols: Float, rows: Float) -> Float:
-        total = np.zeros(cols.shape)
-        middle = np.array([cols.mean(), rows.mean()])
-        reach = float(np.hypot(np.ptp(cols), np.ptp(rows))) / 2
-        for t, seen in needles:
-            if np.hypot(*(t.position_px - middle)) < reach + 1.3 * t.shape.length_px + 10:
-                dx, dy = (cols - t.position_px[0]).ravel(), (rows - t.position_px[1]).ravel()
-                total += needle_image(dx, dy, t, seen).reshape(cols.shape)
-        return total
-
-    balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needle_images if needles else None)
+    balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needles)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching, edged, drawn = balls.rows(keep), touching[keep], edged[keep], drawn[keep]
-    more = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needle_images if needles else None)
+    more = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needles)
     both = join([balls, more])
     like = are_balls(both, limit, optics.sigma_px, noise)[len(balls.depth) :]
     more = more.rows(like & (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins))
     added = np.zeros(len(more.depth), bool)
     balls, (touching, edged, drawn) = join([balls, more]), (np.append(known, added) for known in (touching, edged, drawn))
     for fit in doubtful:
-        if found := part(film, fit, balls, optics, tee_optics, noise, needle_images, is_tee):
+        if found := part(film, fit, balls, optics, tee_optics, noise, needles or _nothing, is_tee):
             tee, ball = found
             apart = np.hypot(*(balls.position_px - ball.position_px[0]).T) > ball.radius_px[0]
             balls = join([balls.rows(apart), ball])
@@ -199,7 +190,7 @@ def _one_polarity(
             tees = [*tees, tee]
 
     def beside(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
-        return images_beside(known, np.array([i]), optics, needle_images if needles else None, cols, rows)
+        return images_beside(known, np.array([i]), optics, needles, cols, rows)
 
     known = balls
     others = tees + pins
@@ -217,6 +208,10 @@ def _one_polarity(
     trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
     evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
     return evidence, Detection(images, sign < 0, optics, noise)
+
+
+def _nothing(cols: Float, _: Float) -> Float:
+    return np.zeros(cols.shape)
 
 
 def _are_rather_balls(film: NDArray[Any], tees: list[NeedleFit], seeds: BallFits, optics: Optics, noise: NoiseModel) -> list[bool]:

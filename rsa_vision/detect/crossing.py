@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import polynomial
 from rsa_vision.detect.needle_images import Images, NeedleFit, NeedleShape, arm_images, needle_image, support
-from rsa_vision.detect.needles import core_pixels, scored
-from rsa_vision.detect.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.patches import columns, cut, weighted_least_squares
+from rsa_vision.detect.needles import between, explains, scored
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.patches import cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
-_STEPS = 16
-_CONVERGED_PX = 1e-3
+_STEPS, _QUICK_STEPS = 16, 3
+_CONVERGED_PX = 4e-3  # a step's change: what is left after it is far less
+_PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
+_AROUND_PX, _AROUND_QUICK_PX = 4.0, 1.0  # beyond three blurs from the arms, which tell the background
 _LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
 _GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
 
@@ -31,8 +33,8 @@ class Window:
     ----------
     cols, rows, data, beside : ndarray of shape (n,)
         Places on the film; its values, the images of neighbours taken away; those images.
-    surface : ndarray of shape (n, 6)
-        Columns of a quadratic background.
+    surface : ndarray of shape (6, n)
+        Parts of a quadratic background.
     corner_px : ndarray of shape (2,)
         (col, row) of the first pixel of the square around them.
     size : int
@@ -55,30 +57,38 @@ class Window:
         return out
 
 
-def window_of(film: NDArray[Any], needles: Sequence[NeedleFit], optics: Optics, noise: NoiseModel, others: Images | None) -> Window:
+def window_of(
+    film: NDArray[Any],
+    needles: Sequence[NeedleFit],
+    optics: Optics,
+    noise: NoiseModel,
+    others: Images | None,
+    around_px: float = _AROUND_PX,
+) -> Window:
     """Cut out the pixels around the arms of some needles, the images of others taken away."""
     middle = np.mean([f.position_px for f in needles], axis=0)
     spread = max(float(np.abs(f.position_px - middle).max()) for f in needles)
     half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in needles) + 3 * optics.sigma_px + 3))
     patch = cut(film, middle[None], half, noise)
     corner = patch.corner_px[0].astype(np.float64)
-    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size]
-    cols, rows = cols + corner[0], rows + corner[1]
-    near = np.zeros(cols.shape, bool)
+    axis = np.arange(float(patch.size))
+    near = np.zeros((patch.size, patch.size), bool)
     for f in needles:
-        near |= support(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, 3 * optics.sigma_px + 4.0)
-    near &= patch.valid[0]
-    cols, rows, raw = cols[near], rows[near], patch.values[0][near]
+        dx, dy = (axis + (first - at) for first, at in zip(corner, f.position_px, strict=True))
+        near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + around_px)
+    rows, cols = np.nonzero(near & patch.valid[0])
+    raw = patch.values[0][rows, cols]
+    cols, rows = cols + corner[0], rows + corner[1]
     beside = np.zeros_like(raw) if others is None else others(cols, rows)
-    return Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]), corner, patch.size)
+    return Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]).T, corner, patch.size)
 
 
 def chi2_of(window: Window, fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
     """Return what a fit leaves of a window, depth and background being free: squared residuals over the variance of the noise."""
     image = needle_image(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit, optics)
     weight = 1.0 / noise.variance_at(np.full(len(window.data), float(np.median(window.data))))
-    linear = columns([image[None], window.surface.T])
-    left = window.data - linear @ weighted_least_squares(linear, weight, window.data)
+    linear = np.concatenate([image[None], window.surface])
+    left = window.data - weighted_least_squares(linear.T, weight, window.data) @ linear
     return float(np.sum(weight * left**2))
 
 
@@ -90,6 +100,7 @@ def fit_crossing(
     *,
     others: Images | None = None,
     steps: int = _STEPS,
+    quick: bool = False,
 ) -> list[NeedleFit]:
     """Fit several pins or tees at once; the arms of each turn together.
 
@@ -104,53 +115,58 @@ def fit_crossing(
         Images of neighbours, which are subtracted first.
     steps : int
         At the most.
+    quick : bool
+        For a first look: few steps, fewer pixels around, and no step at all from starts that explain little of what lies under them.
 
     Returns
     -------
     list of NeedleFit
-        In the order of the starts; figures of merit are taken under each needle's own arms.
+        In the order of the starts, with the covariances of these; figures of merit are taken under each needle's own arms.
     """
     now = list(needles)
-    window = window_of(film, now, optics, noise, others)
-    cols, rows, data, neighbours, surface, half = window.cols, window.rows, window.data, window.beside, window.surface, window.size // 2
-    weight = 1.0 / noise.variance_at(data + neighbours)
-    each = 5
+    window = window_of(film, now, optics, noise, others, _AROUND_QUICK_PX if quick else _AROUND_PX)
+    steps = min(steps, _QUICK_STEPS) if quick else steps
+    cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.size // 2
+    weight = 1.0 / noise.variance_at(data + window.beside)
     converged = False
     ground = np.zeros(len(data))  # background above its mean under each pixel
+
+    def told() -> list[NeedleFit]:
+        residual, background = data - theta @ linear, float(theta[-len(surface)])
+        variance = float(noise.variance_at(np.array([background]))[0])
+        of_each = zip(now, theta[: len(now), None] * tees[:, 0], strict=True)
+        return [scored(replace(f, converged=converged), image, residual, weight, surface, background, variance) for f, image in of_each]
+
     for step in range(steps + 1):
         blocks = [arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, optics) for f in now]
         if optics.proportion:
             blocks = [block * gain_at(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
-        linear = columns([*(b[0].sum(0, keepdims=True) for b in blocks), *lapping([b[0].sum(0) for b in blocks]), surface.T])
-        theta = weighted_least_squares(linear, weight, data, 1e-6)
-        ground = surface[:, 1:] @ theta[-surface.shape[1] + 1 :]
+        tees = np.array([block.sum(1) for block in blocks])  # needles, (image, its derivatives), pixels
+        moves = tees[:, 1:].reshape(-1, len(data))
+        linear = np.concatenate([tees[:, 0], *lapping(tees[:, 0]), surface])
+        weighted = np.concatenate([moves, linear, data[None]]) * np.sqrt(weight)
+        gram = weighted @ weighted.T  # holds the normal equations of depths and background alone as well as of all
+        at = slice(len(moves), -1)
+        theta = damped_solution(gram[at, at], gram[at, -1], 1e-6)
+        ground = theta[1 - len(surface) :] @ surface[1:]
         now = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta[: len(now)], strict=True)]
-        moves = []
-        for f, (_, d_col, d_row, d_w, d_l, d_angle) in zip(now, blocks, strict=True):
-            moves += [(f.depths @ d)[None] for d in (d_col, d_row, d_w, d_l)] + [(f.depths @ d_angle)[None]]
-        jac = columns([*moves, linear.T])
-        residual = data - linear @ theta
         if step == steps or converged:
             break
+        if step == 0 and quick and not any(explains(f, _PROMISING, 0.0) for f in told()):
+            break
+        unit = np.append(np.repeat(theta[: len(now)], tees.shape[1] - 1), np.ones(len(linear)))  # derivatives above are of depth one
+        right = unit * (gram[:-1, -1] - gram[:-1, at] @ theta)
+        delta = damped_solution(gram[:-1, :-1] * np.outer(unit, unit), right, 1e-3 if step < 4 else 1e-6)
+        delta = delta[: len(moves)].reshape(len(now), -1)
         if step in (2, 6):
-            weight = 1.0 / noise.variance_at(linear @ theta + neighbours)
-        delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 4 else 1e-6)[: each * len(now)].reshape(-1, each)
+            weight = 1.0 / noise.variance_at(theta @ linear + window.beside)
         scale = min(1.0, 1.0 / max(float(np.abs(delta[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(delta[:, -1]).max()), 1e-9))
         now = [_moved(f, scale * d, half) for f, d in zip(now, delta, strict=True)]
-        converged = step > 1 and float(np.abs(delta[:, :2]).max()) < _CONVERGED_PX
-    covariance = np.linalg.pinv((jac * weight[:, None]).T @ jac, hermitian=True)
-    places = [each * i + axis for i in range(len(now)) for axis in range(2)]
-    influence = window.square(covariance[places] @ (jac * np.sqrt(weight)[:, None]).T)
-    variance = float(noise.variance_at(np.array([theta[-6]]))[0])
-    out = []
-    for i, (f, block) in enumerate(zip(now, blocks, strict=True)):
-        fit = replace(f, covariance_px2=influence_covariance(influence[2 * i : 2 * i + 2], noise.correlation), converged=converged)
-        whole = core_pixels(f.position_px, f.angles, f.shape, optics.sigma_px)
-        out.append(scored(fit, f.depths @ block[0], residual, weight, surface, float(theta[-6]), variance, whole))
-    return out
+        converged = step > 0 and float(np.abs(delta[:, :2]).max()) < _CONVERGED_PX
+    return told()
 
 
-def lapping(shadows: Sequence[Float]) -> list[Float]:
+def lapping(shadows: Sequence[Float] | Float) -> list[Float]:
     """Return the product of the shadows of two needles, summed over all pairs, as one row, if any lie on each other.
 
     There the film does not show their sum: its curve is bent, and those of two exposures take of each half the light. How much of the
@@ -175,8 +191,3 @@ def _moved(fit: NeedleFit, delta: Float, half: int) -> NeedleFit:
     width = between(fit.shape.half_width_px + wider, 0.6, 0.3 * fit.shape.length_px)
     shape = NeedleShape(width, between(fit.shape.length_px + longer, 3.0, half / 1.05), fit.shape.taper)
     return replace(fit, position_px=fit.position_px + delta[:2], shape=shape, angles=fit.angles + delta[-1])
-
-
-def between(value: float, low: float, high: float) -> float:
-    """Return a value, or the bound that it exceeds."""
-    return min(max(float(value), low), high)

@@ -1,7 +1,7 @@
 """What lies over or under a ball and goes on beside it: wires, their ends and kinks, scratches, dust at its rim.
 
-Beside the ball it shows as residuals. Under the ball the fit takes it for a shift and no residual shows it: pixels in its line are not to be
-believed there.
+Beside the ball it shows as residuals. Under the ball the fit takes it for a shift and no residual shows it: pixels in its line are not
+to be believed there.
 """
 
 from __future__ import annotations

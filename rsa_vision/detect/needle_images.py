@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.detect.profiles import Optics
@@ -19,11 +20,10 @@ from rsa_vision.types import Bool, Float
 Images = Callable[[Float, Float], Float]
 """Images of some marks at pixels (cols, rows), in film values over the background."""
 CELL = 0.3  # pixels between the nodes of a needle table
-GRID_W, GRID_L = 0.25, 1.0  # pixels between the shapes that have tables of their own
-FINE_L, FINE_Q = 0.2, 0.06  # pixels of the length, and the slant, between those of the last fit
-SKEW = 0.1  # for the derivative
-_OF_TABLE = CELL**2 / 4  # variance that the mean over a cell and linear interpolation between nodes add to the blur
-_PAD = 6.0  # blur widths around the needle that a table covers
+GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
+SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
+_OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
+_PAD = 5.0  # blur widths around the needle that a table covers
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,76 +91,98 @@ class NeedleFit:
 
 @lru_cache(maxsize=1024)
 def _opacity(
-    half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float = 0.0, skew: float = 0.0
-) -> tuple[Float, float, float]:
-    """Blurred opacity on a grid along and across a needle, and where that begins.
+    half_width: float,
+    length: float,
+    taper: float,
+    sigma: float,
+    mu: float,
+    bend: float,
+    slant: float,
+    wider: float = 1.0,
+    longer: float = 1.0,
+    blurrier: float = 1.0,
+    skew: float = 0.0,
+) -> Float:
+    """Blurred opacity of a needle so many times wider and longer, on the grid for one of this half width and length stretched with it.
 
     A ray in depth ``z`` of the needle crosses it at the distance ``s + sqrt(slant) z`` from the tip; of its chord only the part before the
     flat end counts. The middle of the chord lies the further behind the further it is from the axis: ``skew`` times the distance.
     """
-    pad = _PAD * sigma
-    s = np.arange(-pad, length + pad + CELL, CELL)
-    p = np.arange(0.0, half_width + pad + CELL, CELL)
-    if skew:
-        p = np.concatenate([-p[:0:-1], p])  # else one half; the other is its mirror image
-    fine_s = (s[:, None] + CELL * (np.arange(2) - 0.5) / 2).reshape(-1, 1)
-    fine_p = (p[:, None] + CELL * (np.arange(2) - 0.5) / 2).ravel()
+    first, (n_s, n_p) = _grid(half_width, length, sigma)
+    cell_s, cell_p = CELL * longer, CELL * wider
+    s = first[0] * longer + cell_s * np.arange(n_s)
+    # without skew one half; the other is its mirror image
+    p = first[1] * wider + cell_p * np.arange(n_p) if skew else cell_p * np.arange(n_p // 2 + 1)
+    half_width, length = half_width * wider, length * longer
+    fine_s = (s[:, None] + cell_s * (np.arange(2) - 0.5) / 2).reshape(-1, 1)
+    fine_p = (p[:, None] + cell_p * (np.arange(2) - 0.5) / 2).ravel()
     width = half_width * np.clip(fine_s / (taper * length), 0.0, 1.0)
     chord = 2 * np.sqrt(np.maximum(width**2 - fine_p**2, 0.0))
     before = length - fine_s - skew * fine_p
     if slant:
         chord *= np.clip(0.5 + before / (np.sqrt(slant) * np.maximum(chord, 1e-9)), 0.0, 1.0)
-    opacity = -np.expm1(-mu * chord) * (1.0 if slant else np.clip(0.5 + before / (CELL / 2), 0.0, 1.0))
+    opacity = -np.expm1(-mu * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
     opacity = opacity.reshape(len(s), 2, len(p), 2).mean((1, 3))
-    blur = np.sqrt(max(sigma**2 - _OF_TABLE, 0.01)) / CELL
-    along = gaussian_filter1d(opacity, blur, axis=0, mode="constant", truncate=4.5)
-    half = gaussian_filter1d(along, blur, axis=1, mode="constant" if skew else "mirror", truncate=4.5)
+    blur_s, blur_p = (np.sqrt(max((blurrier * sigma) ** 2 / cell**2 - _OF_TABLE, 0.1)) for cell in (cell_s, cell_p))
+    along = gaussian_filter1d(opacity, blur_s, axis=0, mode="constant", truncate=4.5)
+    seen: Float = gaussian_filter1d(along, blur_p, axis=1, mode="constant" if skew else "mirror", truncate=4.5)
     if bend:
-        half = np.log1p(-bend * half) / np.log1p(-bend)
-    return half if skew else np.concatenate([half[:, :0:-1], half], axis=1), float(s[0]), -float(p[-1])
+        seen = np.log1p(-bend * seen) / np.log1p(-bend)
+    return seen if skew else np.concatenate([seen[:, :0:-1], seen], axis=1)
+
+
+def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Return where the grid of a table begins along and across the needle, and how many nodes it has."""
+    pad = _PAD * sigma
+    half = int(np.ceil((half_width + pad) / CELL))
+    return (-pad, -half * CELL), (int(np.ceil((length + 2 * pad) / CELL)) + 1, 2 * half + 1)
 
 
 @lru_cache(maxsize=256)
 def _table(
-    half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float | None = None
-) -> tuple[Float, tuple[int, int], float, float]:
-    """Opacity, its slopes along and across the needle, by half width and length, and unless that is None by slant and skew: the last axis.
+    half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float, more: str
+) -> NDArray[np.float32]:
+    """Opacity, its slopes along and across, its derivatives by half width and length as the grid stretches with them, and more: first axis.
 
-    One look-up finds them all.
+    ``more``: "ends" for derivatives by slant and skew, "optics" for those by the logarithms of attenuation and blur and by the taper.
     """
-    film = sigma, mu, bend, slant or 0.0
-    step_l = GRID_L if slant is None else FINE_L
-    base, s0, p0 = _opacity(half_width, length, taper, *film)
-    wide, *_, p1 = _opacity(round(half_width + GRID_W, 4), length, taper, *film)
-    long, *_ = _opacity(half_width, round(length + step_l, 4), taper, *film)
-    side = round((p0 - p1) / CELL)
-    by_width = (wide[: base.shape[0], side : side + base.shape[1]] - base) / GRID_W
-    by_length = (long[: base.shape[0]] - base) / step_l
-    nodes = [base, np.gradient(base, CELL, axis=0), np.gradient(base, CELL, axis=1), by_width, by_length]
-    if slant is not None:
-        more = _opacity(half_width, length, taper, sigma, mu, bend, round(slant + FINE_Q, 4))[0]
-        skew = _opacity(half_width, length, taper, *film, SKEW)[0]
-        nodes += [(more - base) / FINE_Q, (skew - base) / SKEW]
-    return np.stack(nodes, axis=-1).reshape(-1, len(nodes)), base.shape, s0, p0
+    one = half_width, length, taper, sigma, mu, bend, slant
+    base = _opacity(*one)
+    nodes = [(_opacity(*one, wider=GRID) - base) / ((GRID - 1) * half_width), (_opacity(*one, longer=GRID) - base) / ((GRID - 1) * length)]
+    if more == "ends":
+        nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
+    if more == "optics":
+        factor = float(np.exp(STEP))
+        dense, wide = _opacity(*one[:4], mu * factor, bend, slant), _opacity(*one, blurrier=factor)
+        short = _opacity(half_width, length, taper - STEP, *one[3:])
+        nodes += [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
+    table = np.array([base, *np.gradient(base, CELL), *nodes], np.float32)
+    table[:, [0, -1]] = table[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
+    return table
 
 
-def _look_up(table: tuple[Float, tuple[int, int], float, float], s: Float, p: Float) -> Float:
-    """Interpolate all columns of a table bilinearly; 0 beyond it."""
-    nodes, (n_s, n_p), s0, p0 = table
-    at_s, at_p = (s - s0) / CELL, (p - p0) / CELL
-    out = np.zeros((nodes.shape[1], len(s)))
-    inside = np.nonzero((at_s >= 0) & (at_s < n_s - 1) & (at_p >= 0) & (at_p < n_p - 1))[0]
-    at_s, at_p = at_s[inside], at_p[inside]
-    low_s, low_p = at_s.astype(np.intp), at_p.astype(np.intp)
-    part_s, part_p = (at_s - low_s)[:, None], (at_p - low_p)[:, None]
-    first = low_s * n_p + low_p
-    near = nodes.take(first, axis=0)
-    near += part_p * (nodes.take(first + 1, axis=0) - near)
-    far = nodes.take(first + n_p, axis=0)
-    far += part_p * (nodes.take(first + n_p + 1, axis=0) - far)
-    near += part_s * (far - near)
-    out[:, inside] = near.T
-    return out
+def _look_up(table: NDArray[np.float32], first: tuple[float, float], s: Float, p: Float) -> NDArray[np.float32]:
+    """Interpolate all columns of a table bilinearly; 0 beyond it. Single precision is far finer than the tables."""
+    _, n_s, n_p = table.shape
+    at_s, at_p = ((x - start).astype(np.float32) * np.float32(1 / CELL) for x, start in zip((s, p), first, strict=True))
+    for at, last in ((at_s, n_s - 1.01), (at_p, n_p - 1.01)):
+        np.maximum(at, 0.0, out=at)
+        np.minimum(at, np.float32(last), out=at)
+    low_s, low_p = at_s.astype(np.int32), at_p.astype(np.int32)
+    at_s -= low_s
+    at_p -= low_p
+    node = (low_s * n_p + low_p).astype(np.intp)
+    nodes = table.reshape(len(table), -1)
+    near: NDArray[np.float32] = nodes.take(node, axis=1)
+    beside, far, across = (nodes.take(node + step, axis=1) for step in (1, n_p, n_p + 1))
+    for low, high in ((near, beside), (far, across)):
+        high -= low
+        high *= at_p
+        low += high
+    far -= near
+    far *= at_s
+    near += far
+    return near
 
 
 def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
@@ -182,36 +204,43 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
     return image
 
 
-def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None) -> Float:
+def arm_images(
+    dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None, *, by_optics: bool = False
+) -> Float:
     """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the second axis.
 
-    With slants, those by the slant and by the skew of each arm follow.
+    With slants, those by the slant and by the skew of each arm follow; instead, if asked for, those by what is common to all: the
+    logarithms of attenuation and blur, and the taper.
     """
-    # tables stand on a grid of shapes, shared by all needles of a film; in between the image is linear in the shape
-    off_w, off_l = shape.half_width_px % GRID_W, shape.length_px % (GRID_L if slants is None else FINE_L)
+    # tables stand on a grid of shapes, shared by all needles of a film, and are stretched; what else a size changes is linear in between
+    half_width, length = (round(GRID ** np.floor(np.log(size) / np.log(GRID)), 4) for size in (shape.half_width_px, shape.length_px))
+    wider, longer = shape.half_width_px / half_width, shape.length_px / length
     film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
-    key = round(shape.half_width_px - off_w, 4), round(shape.length_px - off_l, 4), round(shape.taper, 3), *film
+    key, first = (half_width, length, round(shape.taper, 3), *film), _grid(half_width, length, film[0])[0]
     c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
     along, across = dx * c + dy * s, dy * c - dx * s
-    ends: list[Float] = []
+    at = along / longer, across / wider
     if slants is None:
-        base, g_s, g_p, more_w, more_l = _look_up(_table(*key), along.ravel(), across.ravel()).reshape(5, *along.shape)
+        columns = _look_up(_table(*key, 0.0, "optics" if by_optics else ""), first, *at)
     else:
-        slant, skew = slants
-        off_q = np.where(slant > 0, slant % FINE_Q, slant)
-        arms = [_look_up(_table(*key, round(q, 4)), a, b) for q, a, b in zip(slant - off_q, along, across, strict=True)]
-        base, g_s, g_p, more_w, more_l, *ends = np.stack(arms, axis=1)
-        base = base + off_q[:, None] * ends[0] + skew[:, None] * ends[1]
+        off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
+        steps = np.round(slants[0] - off_q, 4).tolist()
+        columns = np.stack([_look_up(_table(*key, q, "ends"), first, a, b) for q, a, b in zip(steps, *at, strict=True)], axis=1)
+    value, g_s, g_p, more_w, more_l, *more = columns.astype(np.float64)
+    value += (shape.half_width_px - half_width) * more_w + (shape.length_px - length) * more_l
+    if slants is not None:
+        value += off_q[:, None] * more[0] + slants[1][:, None] * more[1]
+    g_s, g_p = g_s / longer, g_p / wider
     d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
-    value = base + off_w * more_w + off_l * more_l
-    return np.array([value, g_p * s - g_s * c, -g_s * s - g_p * c, more_w, more_l, d_angle, *ends])
+    by_size = [more_w - g_p * across / shape.half_width_px, more_l - g_s * along / shape.length_px]
+    return np.array([value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more])
 
 
 def support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:
-    """Pixels within ``margin`` of an arm's axis rectangle."""
-    inside = np.hypot(dx, dy) < margin
-    for angle in angles:
-        c, s = np.cos(angle), -np.sin(angle)
-        along, across = dx * c + dy * s, -dx * s + dy * c
-        inside |= (along > -margin) & (along < shape.length_px + margin) & (np.abs(across) < shape.half_width_px + margin)
+    """Pixels (rows, columns) within ``margin`` of an arm's axis rectangle, by the offsets of columns and rows from the tip."""
+    inside: Bool = dx**2 + (dy**2)[:, None] < margin**2
+    middle = shape.length_px / 2
+    for c, s in zip(np.cos(angles), -np.sin(angles), strict=True):
+        along, across = (dx * c - middle) + (dy * s)[:, None], (dy * c)[:, None] - dx * s
+        inside |= (np.abs(along) < middle + margin) & (np.abs(across) < shape.half_width_px + margin)
     return inside

@@ -84,9 +84,13 @@ def weighted_least_squares(jac: Float, weight: Float, target: Float, damping: fl
     """
     root = np.sqrt(weight)
     weighted = jac * root[:, None]
-    normal = weighted.T @ weighted
+    return damped_solution(weighted.T @ weighted, weighted.T @ (root * target), damping)
+
+
+def damped_solution(normal: Float, right: Float, damping: float) -> Float:
+    """Solve normal equations whose columns are scaled to one, ``damping`` added to the scaled diagonal."""
     scale = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
-    normal /= scale[:, None] * scale
-    normal.flat[:: len(scale) + 1] += damping
-    solution: Float = np.linalg.solve(normal, weighted.T @ (root * target) / scale) / scale
+    scaled = normal / (scale[:, None] * scale)
+    scaled.flat[:: len(scale) + 1] += damping
+    solution: Float = np.linalg.solve(scaled, right / scale) / scale
     return solution

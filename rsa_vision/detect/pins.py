@@ -99,7 +99,9 @@ def find_pins(
     optics : Optics
         With the attenuation that suits the pins.
     """
-    rough = [f for f in rough if not any(_on_arm(_middle(f), tee) for tee in tees)]
+    middle = np.array([_middle(f) for f in rough]).reshape(-1, 2)
+    on_tees = np.any([np.zeros(len(rough), bool), *(_on_arm(middle, tee) for tee in tees)], axis=0)
+    rough = [f for f, on in zip(rough, on_tees, strict=True) if not on]
     if not rough:
         return [], optics
     taper, sample = _best_taper(film, rough[:_SAMPLE], optics, noise)
@@ -176,7 +178,7 @@ def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
     """
     on = np.zeros(len(position_px), bool)
     for pin in pins:
-        on |= (left > 1 - pin.explained) & np.array([_on_arm(place, pin) for place in position_px], bool)
+        on |= (left > 1 - pin.explained) & _on_arm(position_px, pin)
     return on
 
 
@@ -276,8 +278,10 @@ def _middle(fit: NeedleFit) -> Float:
     return middle
 
 
-def _on_arm(place: Float, needle: NeedleFit) -> bool:
-    dx, dy = place - needle.position_px
+def _on_arm(places: Float, needle: NeedleFit) -> Bool:
+    """Say which places (n, 2) lie on one of a needle's arms or just beyond its ends, shape (n,)."""
+    dx, dy = (places - needle.position_px).T[:, :, None]
     c, s = np.cos(needle.angles), -np.sin(needle.angles)
     along, across = (dx * c + dy * s) / needle.shape.length_px, np.abs(dy * c - dx * s) / needle.shape.half_width_px
-    return bool(((along > -0.3) & (along < 1.2) & (across < 2)).any())
+    on: Bool = ((along > -0.3) & (along < 1.2) & (across < 2)).any(axis=1)
+    return on

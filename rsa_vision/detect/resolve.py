@@ -23,7 +23,7 @@ from rsa_vision.detect.spots import LEAST_KNOWN, find_spot, with_spot
 from rsa_vision.types import Bool, Float, Int
 
 Background = Callable[[Float, Float], Float]
-"""Images of the tees at pixels (cols, rows), in film values."""
+"""Images at pixels (cols, rows), in film values."""
 
 TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the fit of the other
 _MOST_IN_GROUP = 5
@@ -58,7 +58,7 @@ def resolve_balls(
     optics : Optics
     noise : NoiseModel
     tees : callable, optional
-        Images of the tees, to be subtracted.
+        Images of pins and tees, to be subtracted.
 
     Returns
     -------

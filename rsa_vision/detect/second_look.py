@@ -16,8 +16,9 @@ from rsa_vision.detect.candidates import SCALES, Candidates
 from rsa_vision.detect.decide import over_clutter
 from rsa_vision.detect.find import distinct, fit_at, plausible, promising
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import Background, images_beside, inside
+from rsa_vision.detect.resolve import images_beside, inside
 from rsa_vision.types import Bool, Float
 
 _LEAST = 3  # balls that tell what one of them is like
@@ -28,7 +29,7 @@ _SIZE = 1.6  # ratio of the fitted radius to the usual one
 
 
 def look_again(
-    film: NDArray[Any], candidates: Candidates, balls: BallFits, limit: float, optics: Optics, noise: NoiseModel, needles: Background | None
+    film: NDArray[Any], candidates: Candidates, balls: BallFits, limit: float, optics: Optics, noise: NoiseModel, needles: Painted | None
 ) -> BallFits:
     """Fit balls of the usual size at the candidates where none was found.
 
@@ -43,7 +44,7 @@ def look_again(
         Significance that noise alone would exceed too often.
     optics : Optics
     noise : NoiseModel
-    needles : callable, optional
+    needles : Painted, optional
         Images of pins and tees.
 
     Returns
@@ -58,6 +59,8 @@ def look_again(
     scale = SCALES[int(np.argmin([abs(np.log(radius / usual)) for *_, radius in SCALES]))][-1]
     fitting = (candidates.radius_px == scale) & (candidates.roundness > _ROUND)
     place = candidates.position_px[fitting & ~_near(candidates.position_px, balls, usual)]
+    if needles is not None:
+        place = place[~needles.explain(film, place, np.full(len(place), usual))]
 
     def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
         return images_beside(balls, np.arange(0), optics, needles, cols, rows)

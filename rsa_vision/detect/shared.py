@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.alike import true_spread
-from rsa_vision.detect.crossing import Window, between, window_of
+from rsa_vision.detect.crossing import Window, window_of
 from rsa_vision.detect.needle_equations import OF_SLANTS, OPTICS, SHARED, SLANT, Equations, by_optics, linearise
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_sets import clusters, others_beside
-from rsa_vision.detect.needles import core_pixels, scored
+from rsa_vision.detect.needles import between, scored
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 _STEPS = 8
-_CONVERGED = 0.1  # standard deviations of a tip, where those are not below
-_FINEST_PX = 0.02  # for the tables are interpolated
+_CONVERGED = 0.15  # root mean square over the tips, in standard deviations: by that little a few go to and fro for ever
+_FINEST_PX = 0.02  # added to those, for the tables are interpolated
 _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
 _TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
 _SIZE_ERROR = 1.0  # of those, before
@@ -83,14 +83,16 @@ def fit_shared(
     slopes: list[list[Float]] = []
     since = np.full(OPTICS, np.inf)
     sizes = _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
+    last: list[Equations | None] = [None] * len(sets)
     converged = False
     for step in range(steps + 1):
         if np.abs(moved[:OPTICS] - since).max() > _MUCH:
             slopes, since = [by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:OPTICS].copy()
         systems = [
-            linearise(w, m, k, optics, noise, parallel, sizes.typical, spread)
-            for w, m, k, spread in zip(windows, sets, slopes, sizes.spread, strict=True)
+            linearise(w, m, k, optics, noise, parallel, sizes.typical, spread, before)
+            for w, m, k, spread, before in zip(windows, sets, slopes, sizes.spread, last, strict=True)
         ]
+        last = [*systems]
         told = [e.information() for e in systems]
         normal = precision + sum(matrix for matrix, _ in told)
         if step == steps or converged:
@@ -101,11 +103,12 @@ def fit_shared(
         moved += change
         taper += change[2]
         optics = replace(start, mu_px=start.mu_px * float(np.exp(moved[0])), sigma_px=start.sigma_px * float(np.exp(moved[1])))
-        furthest = 0.0
+        surprise = []
         for i, e in enumerate(systems):
-            sets[i], shift = _moved(e.members, e.step(change), change, taper, parallel)
-            furthest = max(furthest, shift / max(e.sharpest_px, _FINEST_PX))
-        converged = step > 0 and furthest < _CONVERGED
+            own = e.step(change)
+            sets[i] = _moved(e.members, own, change, taper, parallel)
+            surprise.append(e.surprise(own, _FINEST_PX))
+        converged = step > 0 and float(np.concatenate(surprise).mean()) < _CONVERGED**2
         sizes = replace(sizes, typical=sizes.typical + change[OPTICS:SHARED])
         if alike and step + 1 == _SIZES_AFTER:
             sizes, converged = _sizes(systems, sets), False
@@ -152,8 +155,8 @@ def _sizes(systems: list[Equations], sets: list[list[NeedleFit]]) -> _Sizes:
     return _Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
 
 
-def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> tuple[list[NeedleFit], float]:
-    """Needles after a step of their own parameters and of the common ones, and how far the furthest tip went."""
+def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> list[NeedleFit]:
+    """Needles after a step of their own parameters and of the common ones."""
     arms = len(members[0].angles)
     wider, longer, turns = *change[OPTICS:SHARED], change[SHARED:]
     turning = 1 if parallel else arms
@@ -170,16 +173,16 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
         slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[4 + turning :]).reshape(2, arms)
         slants = np.clip(slants, [[-SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
         out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants))
-    return out, shift
+    return out
 
 
 def _common_errors(windows: list[Window], systems: list[Equations], normal: Float, precision: Float, noise: NoiseModel) -> Float:
     """Covariance of the common parameters, for noise that neighbouring pixels share."""
     spread = precision.copy()
     for window, e in zip(windows, systems, strict=True):
-        unexplained = e.common - e.own @ e.own_by_common
+        unexplained = e.common - e.own_by_common.T @ e.own
         spread += (
-            influence_covariance(window.square(unexplained.T), noise.correlation)
+            influence_covariance(window.square(unexplained), noise.correlation)
             + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)
         ) / e.excess
     inverse = np.linalg.inv(normal)
@@ -188,16 +191,15 @@ def _common_errors(windows: list[Window], systems: list[Equations], normal: Floa
 
 
 def _finished(window: Window, e: Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
-    to_tips = (e.inverse @ e.own.T)[e.tips] / e.scale[e.tips, None]
-    by_common = (e.own_by_common / e.scale[:, None])[e.tips]
+    to_tips = e.inverse[e.tips] @ e.own
+    by_common = e.own_by_common[e.tips]
     covariance = influence_covariance(window.square(to_tips), noise.correlation) + by_common @ errors @ by_common.T
-    of_prior = (e.inverse[e.tips] * e.prior) / e.scale[e.tips, None]  # what is held near to the expected is not exactly there
+    of_prior = e.inverse[e.tips] * e.prior  # what is held near to the expected is not exactly there
     covariance = covariance + of_prior @ of_prior.T
     variance = float(noise.variance_at(np.array([e.background]))[0])
     out = []
     for i, (fit, image) in enumerate(zip(e.members, e.images, strict=True)):
         at = slice(2 * i, 2 * i + 2)
         fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
-        whole = core_pixels(fit.position_px, fit.angles, fit.shape, optics.sigma_px)
-        out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance, whole))
+        out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance))
     return out

@@ -17,9 +17,10 @@ from rsa_vision.detect.needle_optics import common_optics
 from rsa_vision.detect.needle_sets import TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.painted import paint
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared
-from rsa_vision.detect.templates import SCALE, find_like
+from rsa_vision.detect.templates import SCALE, find_like, template_of
 from rsa_vision.detect.twins import split_twins
 from rsa_vision.types import Float
 
@@ -157,7 +158,7 @@ def _mean_misfit(fits: list[NeedleFit]) -> float:
 
 def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Starts at every place that looks like one of the models."""
-    found = [find_like(film, m, optics) for m in models]
+    found = [find_like(film, template_of(m, optics)) for m in models]
     model = np.repeat(np.arange(len(models)), [len(f) for f in found])
     places = np.concatenate(found)
     starts: list[NeedleFit] = []
@@ -172,14 +173,12 @@ def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: No
 def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Find faint tees whose arms reach among those of brighter ones: what the film looks like without these."""
     starts: list[tuple[float, NeedleFit]] = []
+    painted, seen = paint(film.shape, [(t, optics) for t in tees]), template_of(model, optics)
     for tee in tees:
         half = int(2.5 * tee.shape.length_px)
         left, top = (max(int(x) - half, 0) // SCALE * SCALE for x in tee.position_px)
-        cut = film[top : top + 2 * half, left : left + 2 * half].astype(np.float32)
-        rows, cols = np.mgrid[top : top + cut.shape[0], left : left + cut.shape[1]].astype(np.float64)
-        around = others_beside(tee, tees, optics)
-        rest = cut - around(cols, rows).astype(np.float32) if around else cut
-        for col, row, likeness in find_like(rest, model, optics):
+        box = slice(top, top + 2 * half), slice(left, left + 2 * half)
+        for col, row, likeness in find_like(film[box] - painted.canvas[box], seen):
             place = np.array([col + left, row + top])
             if min(np.hypot(*(t.position_px - place)) for t in tees) > _NEAREST_PX:
                 starts.append((likeness, replace(model, position_px=place)))
@@ -198,7 +197,7 @@ def _peeled(
             break
         in_vain += 1
         others = others_beside(start, kept, optics)
-        fit = fit_crossing(film, [start], optics, noise, others=others, steps=3)[0]
+        fit = fit_crossing(film, [start], optics, noise, others=others, quick=True)[0]
         deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > _FAINTEST * abs(start.depth)
         near = np.hypot(*(fit.position_px - start.position_px)) < 2 * _NEAREST_PX
         if deep and near and is_tee(fit, slack=ROUGH) and all(np.hypot(*(k.position_px - fit.position_px)) > _NEAREST_PX for k in kept):

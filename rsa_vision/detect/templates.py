@@ -21,31 +21,36 @@ LIKENESS = 0.4  # correlation coefficient from which a place is worth a fit; two
 SCALE = 2  # the film is searched at half resolution
 
 
-def find_like(film: NDArray[Any], known: NeedleFit, optics: Optics) -> Float:
+def template_of(known: NeedleFit, optics: Optics) -> NDArray[np.float32]:
+    """Return the image of a known tee at the resolution of the search; its middle pixel is the tip."""
+    half = int(np.ceil(known.shape.length_px + 2 * optics.sigma_px + 2) // SCALE * SCALE)
+    axis = SCALE * (np.arange(-half // SCALE, half // SCALE + 1, dtype=np.float64))
+    coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, SCALE / np.sqrt(12))))
+    return needle_image(*np.meshgrid(axis, axis), known, coarse).astype(np.float32)
+
+
+def find_like(film: NDArray[Any], template: NDArray[np.float32]) -> Float:
     """Find places that look like a known tee.
 
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
-    known : NeedleFit
-    optics : Optics
-        Blur and attenuation of the film.
+    template : ndarray of shape (s, s)
+        As of :func:`template_of`.
 
     Returns
     -------
     ndarray of shape (n, 3)
         col_px, row_px, correlation coefficient; best first.
     """
-    half = int(np.ceil(known.shape.length_px + 2 * optics.sigma_px + 2) // SCALE * SCALE)
     small = cv2.resize(film, (film.shape[1] // SCALE, film.shape[0] // SCALE), interpolation=cv2.INTER_AREA).astype(np.float32)
-    axis = SCALE * (np.arange(-half // SCALE, half // SCALE + 1, dtype=np.float64))
-    coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, SCALE / np.sqrt(12))))
-    template = needle_image(*np.meshgrid(axis, axis), known, coarse).astype(np.float32)
-    if min(small.shape) <= template.shape[0]:
+    side = len(template)
+    if min(small.shape) <= side:
         return np.zeros((0, 3))
     likeness = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED)
-    peak = (likeness > LIKENESS) & (likeness == cv2.dilate(likeness, np.ones((5, 5), np.uint8)))
-    row, col = np.nonzero(peak)
-    centre = half // SCALE
+    row, col = np.divmod(np.flatnonzero(likeness > LIKENESS), likeness.shape[1])
+    peak = likeness[row, col] == cv2.dilate(likeness, np.ones((5, 5), np.uint8))[row, col]
+    row, col = row[peak], col[peak]
+    centre = side // 2
     table = np.stack([(col + centre + 0.5) * SCALE - 0.5, (row + centre + 0.5) * SCALE - 0.5, likeness[row, col]], axis=1)
     return table[np.argsort(-table[:, 2])].astype(np.float64)
