@@ -119,8 +119,10 @@ def in_line(found: Bool, place_px: Float, rim_px: Float) -> Bool:
                 continue
             middle = mine.mean(axis=0)
             spread, axes = np.linalg.eigh(np.cov(mine.T))
-            along = axes[:, 1] if spread[1] > _SLIM * max(spread[0], 1 / 12) else middle / np.hypot(*middle)
-            across = np.array([-along[1], along[0]])
-            half = np.abs((mine - middle) @ across).max() + _MARGIN_PX
-            out[i] |= (np.abs((at - middle) @ across) < half) & (distance < rim_px[i])
+            if spread[1] > _SLIM * max(spread[0], 1 / 12):  # pixels in one row have no spread across but their own
+                across = axes[:, 0]
+                beyond = np.abs((at - middle) @ across) - np.abs((mine - middle) @ across).max()
+            else:
+                beyond = np.hypot(*(at - middle).T) - np.hypot(*(mine - middle).T).max()
+            out[i] |= (beyond < _MARGIN_PX) & (distance < rim_px[i])
     return out

@@ -92,7 +92,7 @@ def resolve_balls(
     like = good.rows(known_well) if np.count_nonzero(known_well) >= LEAST_KNOWN else good
     for members in _unexplained_pairs(film, candidates, good, like, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
-        fits.append(pair.rows(_like(pair, like)))
+        fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     sure = single.rows(clean)
@@ -119,6 +119,7 @@ def resolve_balls(
 
         fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
     found = join([single.rows(slice(0)), *fits])
+    found = found.rows(~_cancelled(found))
     found = found.rows(plausible(found, noise) & inside(found, film))
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
     found, edged = _beside_edges(film, distinct(found.rows(~_taken(found, drawn)), noise), optics, noise, tees)
@@ -191,9 +192,17 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
 
 def _in_one_beam(fits: BallFits) -> Bool:
     """Say whose shadow lies over that of another ball."""
+    return np.asarray((_lapping(fits) & ~np.eye(len(fits.depth), dtype=bool)).any(axis=1))
+
+
+def _cancelled(fits: BallFits) -> Bool:
+    """Say over which lies one of the other polarity: together they may explain anything."""
+    return np.asarray((_lapping(fits) & (np.sign(fits.depth)[:, None] != np.sign(fits.depth))).any(axis=1))
+
+
+def _lapping(fits: BallFits) -> Bool:
     gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
-    over = gap < fits.radius_px[:, None] + fits.radius_px[None]
-    return np.asarray((over & ~np.eye(len(gap), dtype=bool)).any(axis=1))
+    return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
 
 
 def _taken(fits: BallFits, good: BallFits) -> Bool:

@@ -112,7 +112,7 @@ def settle(
             both = OF_SHIFT * apart[:, :, None] * apart[:, None] * edged[part, None, None]  # both models could be right
             both += OF_SHIFT * ((apart**2).sum(axis=1) * crossed)[:, None, None] * np.eye(2)  # what lies on a ball has any profile
             fits.covariance[:, :2, :2] += both
-            moved = free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left)) & (windows.covered < _MOST_COVERED)
+            moved = free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left))
             out = _put(out, part, fits, moved)
             stay = free[part] & crossed & ~moved
             out.covariance[part[stay], :2, :2] += both[stay]
@@ -208,9 +208,9 @@ def _without_others(windows: _Windows, common: _Common) -> _Windows:
     residual = robust_residual(images[some], data[some], weight[some], precision[some])
     found = foreign(residual, weight[some], (windows.valid & ~under)[some], float(noise.gain(np.array(1.0))))
     valid[some] &= ~found & ~in_line(found, local[some], rim[some])
-    return replace(
-        windows, valid=valid, covered=(windows.valid & ~valid & under).sum(axis=1) / np.maximum((windows.valid & under).sum(axis=1), 1)
-    )
+    covered = (windows.valid & ~valid & under).sum(axis=1) / np.maximum((windows.valid & under).sum(axis=1), 1)
+    whole = covered > _MOST_COVERED  # lies under all of the ball, or is its own halo
+    return replace(windows, valid=np.where(whole[:, None], windows.valid, valid), covered=np.where(whole, 0.0, covered))
 
 
 def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -> _Solution:
