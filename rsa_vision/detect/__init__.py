@@ -45,6 +45,7 @@ _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _CAP = 50.0  # significance beyond which a needle is no better evidence
+_OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is saturated: plateaus have rims as well
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
@@ -205,8 +206,9 @@ def _one_polarity(
     keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
     balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
     images = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
-    trusted = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)) == 0
-    evidence = float(np.minimum(images.snr, 50.0)[trusted].sum())
+    cut_off = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED)) != 0
+    trust = np.where(images.flags & MarkerFlag.POOR_FIT, 0.0, np.where(cut_off, _OF_CUT_OFF, 1.0))
+    evidence = float(trust @ np.minimum(images.snr, _CAP))
     return evidence, Detection(images, sign < 0, optics, noise)
 
 

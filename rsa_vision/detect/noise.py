@@ -23,10 +23,6 @@ _MOST_LOOKED_AT = 1500**2  # pixels that tell whether a film is saturated
 _MUCH, _SPECKS = 0.2, 0.2  # part of a film that its background is, part of the runs of pixels in it that are one pixel long
 _ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many times as many as there are within the fourth of such
 _TAIL = 16  # such distances are less than this part of the values
-BLOCK = 8  # pixels
-_MOST_FOR_BLOCKS = 400_000  # pixels that tell whether a film was compressed in blocks
-_LARGEST_STEP = 8.0  # times the usual one
-_BLOCKY = 1.15  # times as much: chance makes hundredths
 _LEVELS = 12  # value classes of the variance curve
 _QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
 _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
@@ -172,41 +168,8 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
-    variance, blocks = np.maximum(curve_array / bias, max(_QUANTISATION, least)), block_variance(film)
-    if blocks:  # whose errors are as good as white
-        usual = float(np.median(variance))
-        correlation = (usual * correlation + blocks * _lag_zero()) / (usual + blocks)
-    return NoiseModel(level_array, variance + blocks, correlation, floor, ceiling)
-
-
-def _lag_zero() -> Float:
-    """Return the correlation of white noise."""
-    at_zero = (np.arange(-LAGS, LAGS + 1) == 0).astype(np.float64)
-    return np.asarray(np.outer(at_zero, at_zero))
-
-
-def block_variance(film: NDArray[Any]) -> float:
-    """Return the variance that compression in blocks (JPEG) adds to a pixel, by how much more neighbours differ across their borders.
-
-    Such a compression rounds away the noise of quiet tiles, and puts errors in the place of what it rounds where marks are.
-
-    Parameters
-    ----------
-    film : ndarray of shape (rows, cols)
-
-    Returns
-    -------
-    float
-        0 where no border of blocks shows.
-    """
-    sample = film[:: max(1, film.size // _MOST_FOR_BLOCKS)].astype(np.int32)
-    step = np.abs(np.diff(sample, axis=1))
-    if step.shape[1] < 2 * BLOCK:
-        return 0.0
-    step = np.minimum(step, max(1, int(_LARGEST_STEP * step.mean())))  # of edges all borders have their share
-    square = np.square(step[:, : step.shape[1] // BLOCK * BLOCK]).reshape(-1, BLOCK).mean(axis=0)
-    inside = float(np.median(square))
-    return 0.5 * (float(square.max()) - inside) if square.max() > _BLOCKY * inside else 0.0
+    variance = np.maximum(curve_array / bias, max(_QUANTISATION, least))
+    return NoiseModel(level_array, variance, correlation, floor, ceiling)
 
 
 def medians(values: NDArray[Any]) -> NDArray[Any]:
