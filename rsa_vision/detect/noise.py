@@ -172,6 +172,12 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     return NoiseModel(level_array, variance, correlation, floor, ceiling)
 
 
+def _lag_zero() -> Float:
+    """Return the correlation of white noise."""
+    at_zero = (np.arange(-LAGS, LAGS + 1) == 0).astype(np.float64)
+    return np.asarray(np.outer(at_zero, at_zero))
+
+
 def medians(values: NDArray[Any]) -> NDArray[Any]:
     """Return the medians along the last axis: those of numpy, which looks for NaN besides, in a tenth of the time."""
     half = values.shape[-1] // 2
