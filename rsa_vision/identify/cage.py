@@ -260,6 +260,7 @@ def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImag
     rivals = [(s, n) for s, n in scored[1:] if are_different(scene, best, n)]
     log_odds = float(np.log(limits.posterior / (1 - limits.posterior)))
     melted = melted_images(scene, best, film)
+    in_one = best.rows[np.isin(best.image[best.rows], melted)]
     if len(melted):
         again = name_marks(scene, best.fit.parameters, film, log_room, banned=melted)
         if again is None:
@@ -274,7 +275,7 @@ def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImag
             return answer.failed("too few marks without doubt")
         best = drop_gross_errors(scene, replace(smaller, dropped=dropped), film, limit_mm, log_room)
         decisive = doubtful_marks(scene, best, film, log_odds)[1]
-    missing = what_is_missing(scene, best)
+    missing = what_is_missing(scene, best, in_one.tolist())
     if missing:
         return answer.failed(missing)
     against = what_contradicts(scene, best, film)

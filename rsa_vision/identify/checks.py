@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -34,15 +35,29 @@ def are_different(scene: Scene, a: Naming, b: Naming) -> bool:
     return bool(same < both.sum() or same < 0.5 * (scene.own & (b.image >= 0)).sum())
 
 
-def what_is_missing(scene: Scene, naming: Naming) -> str:
-    """Return in words which marks are too few, or do not fix the plane or a focus, else nothing."""
+def what_is_missing(scene: Scene, naming: Naming, melted: Sequence[int]) -> str:
+    """Return in words which marks are too few, or do not fix the plane or a focus, else nothing.
+
+    Parameters
+    ----------
+    scene : Scene
+    naming : Naming
+    melted : sequence of int
+        Marks that are there, but in one image with another: they do not count as measured.
+
+    Returns
+    -------
+    str
+    """
+    there = naming.image >= 0
+    there[list(melted)] = True
     fiducials = scene.own & scene.fiducial  # of all foci together: they lie in one plane
-    if few := _too_few(naming, fiducials, 4, "fiducial marks"):
+    if few := _too_few(naming, there, fiducials, 4, "fiducial marks"):
         return few
     if _breadth(scene.xyz_mm[fiducials & (naming.image >= 0)]) < SPREAD * _breadth(scene.xyz_mm[fiducials]):
         return "the fiducial marks found lie nearly in line"
     for k, focus in enumerate(scene.foci):
-        if few := _too_few(naming, scene.own & (scene.focus == k) & ~scene.fiducial, 2, f"control points of focus {focus}"):
+        if few := _too_few(naming, there, scene.own & (scene.focus == k) & ~scene.fiducial, 2, f"control points of focus {focus}"):
             return few
         place = slice(FILM + 3 * k, FILM + 3 * k + 3)
         if np.linalg.eigvalsh(naming.fit.covariance[place, place])[-1] > FIXED_MM**2:  # two points fix a focus unless they lie in one place
@@ -50,9 +65,10 @@ def what_is_missing(scene: Scene, naming: Naming) -> str:
     return ""
 
 
-def _too_few(naming: Naming, wanted: Bool, least: int, name: str) -> str:
-    seen = int((naming.image[wanted] >= 0).sum())
-    return f"only {seen} of {wanted.sum()} {name}" if seen < max(least, np.ceil(FOUND * wanted.sum())) else ""
+def _too_few(naming: Naming, there: Bool, wanted: Bool, least: int, name: str) -> str:
+    measured = int((naming.image[wanted] >= 0).sum())
+    few = measured < least or there[wanted].sum() < FOUND * wanted.sum()
+    return f"only {measured} of {wanted.sum()} {name}" if few else ""
 
 
 def _breadth(points: Float) -> float:
