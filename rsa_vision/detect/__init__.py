@@ -200,8 +200,9 @@ def _one_polarity(
     places = free_places(film, balls, place, reach, optics, noise)
     clear = balls.rows(~touching & ~drawn & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
     under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
-    balls, ratio = settle(film, balls, places, under, ~touching & ~drawn, edged, beside, optics, noise)
+    balls, ratio, covered = settle(film, balls, places, under, ~touching & ~drawn, edged, beside, optics, noise)
     left, poor = _what_is_left(balls, under, noise)
+    poor |= covered
     keep = left < BENT * MISFIT
     keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
     balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]

@@ -21,7 +21,8 @@ _SMOOTH: Final = 3  # pixels a side, over which faint wires add up
 _TOUCHING_PX: Final = 2.5  # from the rim
 _LONG_PX: Final = 8.0  # from the rim, the part of a wire that tells its direction
 _SLIM: Final = 3.0  # ratio of variances from which something has a direction
-_MARGIN_PX: Final = 1.0  # to either side
+_MARGIN_PX: Final = 0.5  # to either side
+_SECTORS, _MOST_ROUND = 16, 0.6  # directions, and the part of them from which things may come
 _AT_EASE: Final = 2.5  # standard deviations beyond which a pixel counts little
 _FALL: Final = 1.5  # of the scale, each round
 _ROUNDS: Final = 14
@@ -111,16 +112,23 @@ def in_line(found: Bool, place_px: Float, rim_px: Float) -> Bool:
     for i in np.flatnonzero(found.any(axis=1)):
         at = np.column_stack([cols, rows]) - place_px[i]
         distance = np.hypot(*at.T)
+        touching = at[found[i] & (distance < rim_px[i] + _TOUCHING_PX)]
+        if len(np.unique(np.floor(np.arctan2(*touching.T) * _SECTORS / (2 * np.pi)))) > _MOST_ROUND * _SECTORS:
+            continue  # the ball's own halo, where a film curve bends its profile
         count, label = cv2.connectedComponents((found[i] & (distance < rim_px[i] + _LONG_PX)).reshape(side, side).astype(np.uint8))
         label = label.ravel()
         for part in range(1, count):
             mine = at[label == part]
             if len(mine) < 2 or np.hypot(*mine.T).min() > rim_px[i] + _TOUCHING_PX:
                 continue
-            middle = mine.mean(axis=0)
+            middle, away = mine.mean(axis=0), np.hypot(*mine.T)
             spread, axes = np.linalg.eigh(np.cov(mine.T))
-            if spread[1] > _SLIM * max(spread[0], 1 / 12):  # pixels in one row have no spread across but their own
+            long = away.max() > rim_px[i] + _LONG_PX - 1
+            if long or spread[1] > _SLIM * max(spread[0], 1 / 12):  # pixels in one row have no spread across but their own
                 across = axes[:, 0]
+                if long:  # a broad one as well
+                    along = mine[away > np.median(away)].mean(axis=0) - mine[away <= np.median(away)].mean(axis=0)
+                    across = np.array([-along[1], along[0]]) / np.hypot(*along)
                 beyond = np.abs((at - middle) @ across) - np.abs((mine - middle) @ across).max()
             else:
                 beyond = np.hypot(*(at - middle).T) - np.hypot(*(mine - middle).T).max()

@@ -35,7 +35,7 @@ Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 _UNEVEN = 1.25  # the same, from which something may lie there
-_MOST_COVERED = 0.75  # of a ball: from less it cannot be measured
+MOST_COVERED = 0.85  # of a ball: from less it cannot be measured
 _TINY = 1e-12
 _NONE = 1e-3  # of the noise: what is not there
 _STEPS = 4  # from where the fit on a quadratic background came to rest
@@ -59,7 +59,7 @@ def settle(
     beside: Beside,
     optics: Optics,
     noise: NoiseModel,
-) -> tuple[BallFits, Float]:
+) -> tuple[BallFits, Float, Bool]:
     """Fit the centres of balls once more.
 
     Parameters
@@ -84,9 +84,11 @@ def settle(
         With new centres, their covariances, and what is left of the windows.
     ratio : ndarray of shape (n,)
         Squared errors that free places would make of these centres over those that the covariances promise.
+    covered : ndarray of bool, shape (n,)
+        Something else lies on nearly all of it.
     """
     if len(balls.depth) == 0:
-        return balls, np.ones(0)
+        return balls, np.ones(0), np.zeros(0, bool)
     around = texture(places, len(free), noise)
     structure = np.where(free[:, None], around.structure, 0.0)
     alone, level = free & ~edged & (balls.chi2_ring < EDGE), mean_beside(places, len(free))
@@ -99,16 +101,17 @@ def settle(
         proportion(balls.depth[told], balls.background[told], level[told]),
         around.differ,
     )
-    out, ratios = replace(balls, covariance=under * balls.covariance), []
+    out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
         for begin in range(0, len(these.balls), _BATCH):
             part = these.balls[begin : begin + _BATCH]
-            windows = _without_others(_windows(film, balls, part, these.half, beside, noise), common)
+            windows = _without_others(_windows(film, balls, part, these.half, beside, noise), edged[part], common)
             solution = _solve(windows, known, structure[part], common)
             fits = _fits(windows, solution, known, common)
             left = fits.chi2_uneven - balls.chi2_uneven[part] > CHANCE * noise.scatter(fits.n_core)
-            crossed, apart = windows.covered > 0, fits.position_px - balls.position_px[part]
+            covered[part] = windows.covered
+            crossed, apart = (windows.covered > 0) & (windows.covered <= MOST_COVERED), fits.position_px - balls.position_px[part]
             both = OF_SHIFT * apart[:, :, None] * apart[:, None] * edged[part, None, None]  # both models could be right
             both += OF_SHIFT * ((apart**2).sum(axis=1) * crossed)[:, None, None] * np.eye(2)  # what lies on a ball has any profile
             fits.covariance[:, :2, :2] += both
@@ -120,7 +123,7 @@ def settle(
             by_background = solution.estimator * solution.shade
             errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
         ratios.append(errors)
-    return out, around_each(ratios, places, len(free), _QUIETEST, _QUARTILE)[:, 0]
+    return out, around_each(ratios, places, len(free), _QUIETEST, _QUARTILE)[:, 0], covered > MOST_COVERED
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,28 +192,34 @@ def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: 
     )
 
 
-def _without_others(windows: _Windows, common: _Common) -> _Windows:
+def _without_others(windows: _Windows, edged: Bool, common: _Common) -> _Windows:
     """Mask the pixels of wires, dust and scratches, under the balls as well."""
-    fits, half, noise, sigma_px = windows.fits, windows.half, common.noise, common.optics.sigma_px
+    half, noise, sigma_px, some = (
+        windows.half,
+        common.noise,
+        common.optics.sigma_px,
+        np.flatnonzero((windows.fits.chi2_ring > _UNEVEN) | edged),
+    )
+    fits, before = windows.fits.rows(some), windows.valid[some]
     rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
-    local, rim = fits.position_px - windows.corner_px, fits.radius_px + sigma_px
+    local, rim, depth = fits.position_px - windows.corner_px[some], fits.radius_px + sigma_px, fits.depth[:, None]
     table = ball_table(round(common.optics.mu_px * sigma_px, 3))
     value, *by = (shape.astype(np.float64) for shape in slopes(table, cols - local[:, :1], rows - local[:, 1:], fits.radius_px, sigma_px))
-    surface = np.broadcast_to(polynomial(half, cols - half, rows - half).T, (len(local), 6, len(cols)))
-    images = np.concatenate([np.stack([*(fits.depth[:, None] * slope for slope in by), value], axis=1), surface], axis=1)
-    weight = windows.valid / noise.variance_at(fits.depth[:, None] * value + windows.added)
-    under = np.hypot(cols - local[:, :1], rows - local[:, 1:]) < rim[:, None]
+    surface = np.broadcast_to(polynomial(half, cols - half, rows - half).T, (len(some), 6, len(cols)))
+    images = np.concatenate([np.stack([*(depth * slope for slope in by), value], axis=1), surface], axis=1)
     target, held = _hold(fits, common)
     precision = np.zeros(images.shape[:2])
     precision[:, 2] = held
-    data = windows.data - fits.depth[:, None] * (value + (target - fits.radius_px)[:, None] * by[2])
-    some, valid = np.flatnonzero(fits.chi2_ring > _UNEVEN), windows.valid.copy()
-    residual = robust_residual(images[some], data[some], weight[some], precision[some])
-    found = foreign(residual, weight[some], (windows.valid & ~under)[some], float(noise.gain(np.array(1.0))))
-    valid[some] &= ~found & ~in_line(found, local[some], rim[some])
-    covered = (windows.valid & ~valid & under).sum(axis=1) / np.maximum((windows.valid & under).sum(axis=1), 1)
-    whole = covered > _MOST_COVERED  # lies under all of the ball, or is its own halo
-    return replace(windows, valid=np.where(whole[:, None], windows.valid, valid), covered=np.where(whole, 0.0, covered))
+    at_target = depth * (value + (target - fits.radius_px)[:, None] * by[2])
+    weight = before / noise.variance_at(depth * value + windows.added[some])
+    residual = robust_residual(images, windows.data[some] - at_target, weight, precision)
+    under = np.hypot(cols - local[:, :1], rows - local[:, 1:]) < rim[:, None]
+    found = foreign(residual, weight, before & ~under, float(noise.gain(np.array(1.0))))
+    after = before & ~found & ~in_line(found, local, rim)
+    part = (before & ~after & under).sum(axis=1) / np.maximum((before & under).sum(axis=1), 1)
+    valid, covered = windows.valid.copy(), windows.covered.copy()
+    valid[some], covered[some] = np.where((part > MOST_COVERED)[:, None], before, after), part
+    return replace(windows, valid=valid, covered=covered)
 
 
 def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -> _Solution:

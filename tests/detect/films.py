@@ -62,3 +62,21 @@ def grid_of_balls(
     axis = spacing_px * (np.arange(n) + 0.75)
     position = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + rng.uniform(-2, 2, (n * n, 2))
     return position, np.linspace(*radius_px, n * n)
+
+
+def strip(
+    shape: tuple[int, int], begin: NDArray[np.float64], end: NDArray[np.float64], width_px: float, sigma_px: float
+) -> NDArray[np.float64]:
+    """Return the image of a strip of depth one between two points (col, row), blurred, shape (rows, cols)."""
+    out = np.zeros(shape)
+    far = int(np.ceil(width_px + 6 * sigma_px))
+    low = np.maximum(np.floor(np.minimum(begin, end)).astype(int) - far, 0)
+    high = np.minimum(np.ceil(np.maximum(begin, end)).astype(int) + far + 1, np.array(shape[::-1]))
+    cols, rows = ((np.arange((high[k] - low[k]) * FINE) + 0.5) / FINE - 0.5 + low[k] for k in (0, 1))
+    length = float(np.hypot(*(end - begin)))
+    c, r = (end - begin) / length
+    u = (cols - begin[0]) * c + (rows[:, None] - begin[1]) * r
+    v = (rows[:, None] - begin[1]) * c - (cols - begin[0]) * r
+    inside = ((u > 0) & (u < length) & (np.abs(v) < width_px / 2)).reshape(high[1] - low[1], FINE, high[0] - low[0], FINE)
+    out[low[1] : high[1], low[0] : high[0]] = gaussian_filter(inside.mean(axis=(1, 3)), sigma_px, mode="nearest")
+    return out

@@ -4,26 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.types import Float
 
-from .films import film_of_balls, grid_of_balls, stored
+from .films import film_of_balls, grid_of_balls, stored, strip
 
-SIDE, SIGMA_PX, FINE = 700, 1.2, 4
+SIDE, SIGMA_PX = 700, 1.2
 RADIUS_PX, DEPTH = 4.5, 0.35
 CROSS = np.array([350.0, 350.0])
-
-
-def strip(begin: Float, end: Float, width_px: float) -> Float:
-    """Return the image of a strip of depth one, blurred."""
-    row, col = (np.mgrid[0 : SIDE * FINE, 0 : SIDE * FINE] + 0.5) / FINE - 0.5
-    along = (end - begin) / np.hypot(*(end - begin))
-    u = (col - begin[0]) * along[0] + (row - begin[1]) * along[1]
-    v = -(col - begin[0]) * along[1] + (row - begin[1]) * along[0]
-    inside = (u > 0) & (u < np.hypot(*(end - begin))) & (np.abs(v) < width_px / 2)
-    return np.asarray(gaussian_filter(inside.reshape(SIDE, FINE, SIDE, FINE).mean(axis=(1, 3)), SIGMA_PX))
 
 
 def film_with(strips: Float, depth: float, *, ball: bool) -> tuple[Float, Float]:
@@ -51,7 +40,7 @@ SHAPES = {
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("depth", [0.2, 0.5])
 def test_what_goes_on_beyond_its_rim_is_no_ball(shape: str, depth: float) -> None:
-    strips = np.clip(sum(strip(CROSS, turned(angle, 90.0), width) for angle, width in SHAPES[shape]), 0.0, 1.0)
+    strips = np.clip(sum(strip((SIDE, SIDE), CROSS, turned(angle, 90.0), width, SIGMA_PX) for angle, width in SHAPES[shape]), 0.0, 1.0)
     film, truth = film_with(strips, depth, ball=False)
     found = detect_markers(stored(film), bits=16).images.position_px
     gap = np.hypot(*(found[:, None] - truth).transpose(2, 0, 1))
@@ -61,7 +50,7 @@ def test_what_goes_on_beyond_its_rim_is_no_ball(shape: str, depth: float) -> Non
 
 @pytest.mark.parametrize("shape", ["end of a bar", "kink", "crossing"])
 def test_balls_over_wires_stay(shape: str) -> None:
-    strips = np.clip(sum(strip(CROSS, turned(angle, 90.0), 5.0) for angle, _ in SHAPES[shape]), 0.0, 1.0)
+    strips = np.clip(sum(strip((SIDE, SIDE), CROSS, turned(angle, 90.0), 5.0, SIGMA_PX) for angle, _ in SHAPES[shape]), 0.0, 1.0)
     film, truth = film_with(strips, 0.1, ball=True)
     found = detect_markers(stored(film), bits=16).images
     gap = np.hypot(*(found.position_px - truth[-1]).T)
