@@ -24,7 +24,7 @@ from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import images_beside, resolve_balls
+from rsa_vision.detect.resolve import doubt_of_number, images_beside, resolve_balls
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
@@ -299,7 +299,7 @@ def _table(
     # whatever lies around it, what was found of a ball lies under its image: evenly spread over a disc at worst
     most = 0.25 * (balls.radius_px + optics.sigma_px) ** 2
     covariance[:n] *= np.minimum(1.0, most / np.linalg.eigvalsh(covariance[:n])[:, -1])[:, None, None]
-    covariance[:n] += EXACT_PX**2 * np.eye(2)
+    covariance[:n] += EXACT_PX**2 * np.eye(2) + doubt_of_number(balls)
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))

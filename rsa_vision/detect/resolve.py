@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.decide import hopeless, look_clear
+from rsa_vision.detect.decide import SURE, hopeless, look_clear
 from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
@@ -198,6 +198,35 @@ def _in_one_beam(fits: BallFits) -> Bool:
 def _cancelled(fits: BallFits) -> Bool:
     """Say over which lies one of the other polarity: together they may explain anything."""
     return np.asarray((_lapping(fits) & (np.sign(fits.depth)[:, None] != np.sign(fits.depth))).any(axis=1))
+
+
+def doubt_of_number(fits: BallFits) -> Float:
+    """Return the variances that three or more lapping balls have because they may be one fewer, shape (n, 2, 2), px^2.
+
+    Where one of them is faint, two in a row of three could have come from one between them: half their distance from where it is.
+
+    Parameters
+    ----------
+    fits : BallFits
+
+    Returns
+    -------
+    ndarray of shape (n, 2, 2)
+        Zero for single balls, for pairs, and where all are beyond doubt.
+    """
+    out = np.zeros((len(fits.depth), 2, 2))
+    if len(out) == 0:
+        return out
+    lapping: Any = _lapping(fits)
+    _, label = connected_components(csr_array(lapping), directed=False)
+    for k in np.flatnonzero(np.bincount(label) > 2):
+        members = np.flatnonzero(label == k)
+        if fits.significance[members].min() < SURE:
+            apart = fits.position_px[members][:, None] - fits.position_px[members]
+            nearest = (np.hypot(*apart.transpose(2, 0, 1)) + 1e9 * np.eye(len(members))).argmin(axis=1)
+            half = 0.5 * apart[np.arange(len(members)), nearest]
+            out[members] = half[:, :, None] * half[:, None]
+    return out
 
 
 def _lapping(fits: BallFits) -> Bool:
