@@ -15,7 +15,19 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
-from rsa_vision.detect.find import CHANCE, MISFIT, ROUNDNESS, STRENGTH, distinct, first_look, fit_at, misfit, plausible, significance_limit
+from rsa_vision.detect.find import (
+    CHANCE,
+    DOUBTFUL,
+    MISFIT,
+    ROUNDNESS,
+    STRENGTH,
+    distinct,
+    first_look,
+    fit_at,
+    misfit,
+    plausible,
+    significance_limit,
+)
 from rsa_vision.detect.leftover import noise_under
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needle_images import NeedleFit
@@ -38,7 +50,6 @@ __all__ = ["Detection", "detect_markers"]
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE = 0.999  # part of the pixels under a ball
-POOR = 0.6  # of the misfit that a ball may leave
 BENT = 1.5  # the same once an edge or bending surfaces around it could have taken it up
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
@@ -248,7 +259,7 @@ def _what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Flo
     """Return the misfit of each ball, and which are not described well."""
     under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
     left = misfit(under, noise, CHANCE)
-    return left, (left > POOR * MISFIT) | (balls.chi2_ring > EDGE)
+    return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE)
 
 
 def _table(
@@ -292,7 +303,7 @@ def _table(
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < 0.8] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
-    poor = np.concatenate([poor_ball, np.array([t.misfit for t in tees]) > POOR * MISFIT])
+    poor = np.concatenate([poor_ball, np.array([t.misfit for t in tees]) > DOUBTFUL * MISFIT])
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it
     covariance[poor] += (_SOMEWHERE * radius[poor] ** 2)[:, None, None] * np.eye(2)

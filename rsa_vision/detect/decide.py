@@ -16,7 +16,7 @@ FAINT = 0.1  # marks of one film are at least so high against the typical one, w
 UNEXCUSED = 0.5  # those below that have to fit closely
 EDGE = 16.0  # more variance than this around a ball, in units of the noise, is an edge beside it; edges do not look like balls
 SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
-_LEAST_PATTERNS = 3  # sure balls from which their sizes tell something of the others
+LEAST_KNOWN = 3  # balls that tell what one of them is like on this film
 _COMPANY = 6  # sure ones of one size that stand for each other where none is clear enough for a pattern
 _LIKE = 1.25  # images whose spreads are within this factor are of one size
 _SMALLER, _LARGER = 0.7, 1.45  # range of sizes around those of the sure ones: marks of one film are of few sizes
@@ -51,7 +51,7 @@ def hopeless(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:
     """
     pattern = look_clear(fits, noise)
     radii = _sizes(fits, pattern, sigma_px)
-    if len(radii) < _LEAST_PATTERNS:
+    if len(radii) < LEAST_KNOWN:
         return np.zeros(len(pattern), bool)
     height = _height(fits, sigma_px)
     faint = (height < UNEXCUSED * np.median(height[pattern])) & (fits.explained < EXPLAINED)
@@ -85,7 +85,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     height = _height(fits, sigma_px)
     pattern = _not_faint(sure & close & (fits.explained > CLOSE), height)
     radii = _sizes(fits, pattern, sigma_px)
-    if len(radii) < _LEAST_PATTERNS:
+    if len(radii) < LEAST_KNOWN:
         # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
         company = _of_like_spread(_spread(fits, sigma_px), sure) >= _COMPANY
         return np.asarray(sure & (company | (close & (strength > ALONE))))

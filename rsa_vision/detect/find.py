@@ -22,6 +22,7 @@ STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real 
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
+DOUBTFUL = 0.6  # of it: more may be two balls, or something else
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
 PROMISING = 0.75  # of the significance a mark must have: a quick fit may be so far off

@@ -15,7 +15,7 @@ from rsa_vision.detect.alike import SD_OF_MAD
 from rsa_vision.detect.ball_equations import invert
 from rsa_vision.types import Bool, Float
 
-FAR: Final = 5.0  # standard deviations that noise does not reach
+_FAR: Final = 5.0  # standard deviations that noise does not reach
 _MOST_FOREIGN: Final = 0.3  # part of what is around a ball; where it is more, the background itself is another
 _SMOOTH: Final = 3  # pixels a side, over which faint wires add up
 _TOUCHING_PX: Final = 2.5  # from the rim
@@ -54,7 +54,7 @@ def foreign(residual: Float, weight: Float, where: Bool, gain: float) -> Bool:
     found = np.zeros(where.shape, bool)
     for off in (np.abs(normed), np.abs(smooth)):
         usual = np.array([np.median(row[here]) if here.any() else 0.0 for row, here in zip(off, where & (weight > 0), strict=True)])
-        found |= where & (off > FAR * np.maximum(1.0, SD_OF_MAD * usual)[:, None])
+        found |= where & (off > _FAR * np.maximum(1.0, SD_OF_MAD * usual)[:, None])
     little = found.sum(axis=1) < _MOST_FOREIGN * where.sum(axis=1)
     return np.asarray(found & little[:, None])
 

@@ -14,20 +14,22 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.decide import SURE, hopeless, look_clear
-from rsa_vision.detect.find import MISFIT, distinct, fit_at, misfit, plausible, promising
+from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear
+from rsa_vision.detect.find import DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.spots import LEAST_KNOWN, find_spot, with_spot
+from rsa_vision.detect.spots import find_spot, with_spot
 from rsa_vision.types import Bool, Float, Int
 
 Background = Callable[[Float, Float], Float]
 """Images at pixels (cols, rows), in film values."""
 
+Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
+"""Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
+
 TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the fit of the other
 _MOST_IN_GROUP = 5
-DOUBTFUL = 0.6  # of the misfit that a ball may leave: more may be two balls
 OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added to the stated variance
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
 _FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
@@ -76,11 +78,11 @@ def resolve_balls(
     needles = tees
     others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
-    like_balls = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-    clear = single.rows(like_balls & look_clear(single, noise))
-    drawn, spot = find_spot(film, single.rows(~like_balls), clear, optics, noise, others)
+    clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
+    drawn, spot = find_spot(film, single.rows(~clean), single.rows(clean & look_clear(single, noise)), optics, noise, others)
     if spot is not None:
-        single, tees = single.rows(~_taken(single, drawn)), with_spot(tees, drawn, spot, optics)
+        rest = ~_taken(single, drawn)
+        single, clean, tees = single.rows(rest), clean[rest], with_spot(tees, drawn, spot, optics)
     good = single.rows(plausible(single, noise, slack=1.5))
 
     def groups_worth_fitting() -> list[list[int]]:
@@ -88,12 +90,11 @@ def resolve_balls(
         return [g for g in _groups(good, optics) if worth[g].any()]
 
     groups, fits = groups_worth_fitting(), []
-    known_well = look_clear(good, noise)
-    like = good.rows(known_well) if np.count_nonzero(known_well) >= LEAST_KNOWN else good
+    clear = look_clear(good, noise)
+    like = good.rows(clear) if np.count_nonzero(clear) >= LEAST_KNOWN else good
     for members in _unexplained_pairs(film, candidates, good, like, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
-    clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     sure = single.rows(clean)
     nobody = np.arange(0)

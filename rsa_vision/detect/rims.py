@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final
 
 import cv2
@@ -10,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.resolve import Beside
 from rsa_vision.types import Bool, Float, Int
-
-Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
-"""Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
 
 BEYOND: Final = 2.0  # blur widths outside the rim, where hardly anything of a ball is left
 AS_HIGH: Final = 0.8  # of the height: a ball over the strongest thing that it still outdoes has half

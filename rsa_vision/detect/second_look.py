@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
 from rsa_vision.detect.candidates import SCALES, Candidates
-from rsa_vision.detect.decide import over_clutter
+from rsa_vision.detect.decide import LEAST_KNOWN, over_clutter
 from rsa_vision.detect.find import distinct, fit_at, plausible, promising
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
@@ -21,7 +21,6 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import images_beside, inside
 from rsa_vision.types import Bool, Float
 
-_LEAST = 3  # balls that tell what one of them is like
 _CLEAR = 0.9  # of the limit, over clutter
 _FAR, _SLACK = 1.5, 1.4  # times the limit, times the misfit that is tolerated otherwise
 _ROUND = 0.4  # the filter that suits the usual size answers balls of it by round extrema
@@ -53,7 +52,7 @@ def look_again(
         What may be balls, beside those found so far.
     """
     none = balls.rows(np.zeros(len(balls.depth), bool))
-    if len(balls.depth) < _LEAST:
+    if len(balls.depth) < LEAST_KNOWN:
         return none
     usual = float(np.median(balls.radius_px))
     scale = SCALES[int(np.argmin([abs(np.log(radius / usual)) for *_, radius in SCALES]))][-1]

@@ -10,7 +10,6 @@ estimator, held over the free places, shows what errors are left.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,13 +24,10 @@ from rsa_vision.detect.foreign import foreign, in_line, robust_residual
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
-from rsa_vision.detect.resolve import OF_SHIFT
+from rsa_vision.detect.resolve import OF_SHIFT, Beside
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import Proportion, Size, proportion, usual_size
 from rsa_vision.types import Bool, Float, Int
-
-Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
-"""Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 _UNEVEN = 1.25  # the same, from which something may lie there
@@ -194,12 +190,8 @@ def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: 
 
 def _without_others(windows: _Windows, edged: Bool, common: _Common) -> _Windows:
     """Mask the pixels of wires, dust and scratches, under the balls as well."""
-    half, noise, sigma_px, some = (
-        windows.half,
-        common.noise,
-        common.optics.sigma_px,
-        np.flatnonzero((windows.fits.chi2_ring > _UNEVEN) | edged),
-    )
+    half, noise, sigma_px = windows.half, common.noise, common.optics.sigma_px
+    some = np.flatnonzero((windows.fits.chi2_ring > _UNEVEN) | edged)
     fits, before = windows.fits.rows(some), windows.valid[some]
     rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
     local, rim, depth = fits.position_px - windows.corner_px[some], fits.radius_px + sigma_px, fits.depth[:, None]

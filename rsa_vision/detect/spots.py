@@ -16,18 +16,16 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, slopes, uneven
-from rsa_vision.detect.decide import SURE, over_clutter
-from rsa_vision.detect.find import MISFIT, misfit, plausible
+from rsa_vision.detect.decide import LEAST_KNOWN, SURE, over_clutter
+from rsa_vision.detect.find import DOUBTFUL, MISFIT, misfit, plausible
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.types import Bool, Float
 
-ODD = 0.6  # of the misfit that a ball may leave
 COMPANY = 6  # odd ones that one spot has to explain: twice what it has parameters, less one
 _MOST = 12  # that tell the spot roughly
 _EXPLAINED = 0.85
-LEAST_KNOWN = 3  # balls that tell what one of them looks like on this film
 _FAINT = 0.25  # of the depth of those, or of the sixth deepest: bone
 _LIKE = 1.25  # ratio of radii
 _REACH = 0.8  # of the radius: what is spread farther is no ball with a spot, but a rod or a pair
@@ -138,12 +136,12 @@ def find_spot(
     best, _ = min(trials, key=lambda trial: float(np.log(trial[1]).sum()))
     window = _window(film, odd, half, others, noise)
     state, _ = _fitted(window, _start(odd, window, best.along), _LAST_STEPS, optics, noise, radius)
-    if state.along[2] ** 2 < (_ACROSS * np.hypot(*state.along[:2])) ** 2:
+    if abs(state.along[2]) < _ACROSS * np.hypot(*state.along[:2]):
         return none, None
     fits = _table(window, state, odd, optics, noise)
     rest, before = misfit(fits, noise), misfit(odd, noise)
     alike = np.abs(np.log(fits.radius_px / np.median(fits.radius_px))) < np.log(_LIKE)  # others are at another height
-    kept = alike & plausible(fits, noise) & (rest < np.maximum(ODD * MISFIT, _BETTER * before))
+    kept = alike & plausible(fits, noise) & (rest < np.maximum(DOUBTFUL * MISFIT, _BETTER * before))
     return (fits.rows(kept), spot_of(state.along)) if np.count_nonzero(kept & (rest < _BETTER * before)) >= COMPANY else (none, None)
 
 

@@ -260,13 +260,12 @@ def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImag
     rivals = [(s, n) for s, n in scored[1:] if are_different(scene, best, n)]
     log_odds = float(np.log(limits.posterior / (1 - limits.posterior)))
     melted = melted_images(scene, best, film)
-    in_one = best.rows[np.isin(best.image[best.rows], melted)]
+    in_one = tuple((int(row), int(best.image[row])) for row in best.rows if best.image[row] in melted)
     if len(melted):
         again = name_marks(scene, best.fit.parameters, film, log_room, banned=melted)
         if again is None:
             return answer.failed("the images of both foci melt into one another")
-        lost = tuple((int(row), int(best.image[row])) for row in best.rows if best.image[row] in melted)
-        best = drop_gross_errors(scene, replace(again, dropped=lost), film, limit_mm, log_room)
+        best = drop_gross_errors(scene, replace(again, dropped=in_one), film, limit_mm, log_room)
     doubtful, decisive = doubtful_marks(scene, best, film, log_odds)
     if doubtful:
         dropped = (*best.dropped, *((row, int(best.image[row])) for row in doubtful))
@@ -275,7 +274,7 @@ def _decide(answer: _Answer, scene: Scene, namings: list[Naming], film: FilmImag
             return answer.failed("too few marks without doubt")
         best = drop_gross_errors(scene, replace(smaller, dropped=dropped), film, limit_mm, log_room)
         decisive = doubtful_marks(scene, best, film, log_odds)[1]
-    missing = what_is_missing(scene, best, in_one.tolist())
+    missing = what_is_missing(scene, best, [row for row, _ in in_one])
     if missing:
         return answer.failed(missing)
     against = what_contradicts(scene, best, film)
