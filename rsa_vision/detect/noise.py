@@ -69,6 +69,11 @@ class NoiseModel:
         return np.asarray((shared * self.correlation).sum((-2, -1)))
 
     @property
+    def is_white(self) -> bool:
+        """Noise of neighbouring pixels is independent."""
+        return bool(np.count_nonzero(self.correlation) <= 1)
+
+    @property
     def typical_sd(self) -> float:
         """Standard deviation of one pixel at the middle of the film's values."""
         return float(np.sqrt(np.median(self.variance)))

@@ -27,18 +27,20 @@ from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.resolve import OF_SHIFT, Beside
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import Proportion, Size, proportion, usual_size
+from rsa_vision.detect.whitening import whiten
 from rsa_vision.types import Bool, Float, Int
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 _UNEVEN = 1.25  # the same, from which something may lie there
 MOST_COVERED = 0.85  # of a ball: from less it cannot be measured
 _TINY = 1e-12
-_NONE = 1e-3  # of the noise: what is not there
+_NONE = 1e-3  # of the noise, or of a promised error: what is not there
+_QUIETEST = 0.6  # of a promised squared error
+_ROUNDED = 1.0  # variance of noise up to which areas have one value
 _STEPS = 4  # from where the fit on a quadratic background came to rest
 _MAX_STEP_PX = 0.7
 _FIXED = 1e6  # inverse variance of a radius that is not fitted
 _OUTLIER = 3.0  # standard deviations from which a ball has a size of its own
-_QUIETEST = 0.6  # less than that is chance
 _QUARTILE, _OF_CHANCE = 0.75, 2.773  # the upper one, of chi2 with two degrees of freedom: errors by bone have longer tails than it
 _PER_BALL = 10  # centre, radius, depth, and the six coefficients of a quadratic surface
 _BATCH = 20
@@ -119,7 +121,7 @@ def settle(
             by_background = solution.estimator * solution.shade
             errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
         ratios.append(errors)
-    return out, around_each(ratios, places, len(free), _QUIETEST, _QUARTILE)[:, 0], covered > MOST_COVERED
+    return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], covered > MOST_COVERED
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +155,7 @@ class _Solution:
 
     local_px: Float  # (n, 2), centres in the windows
     radius_px: Float
-    images: Float  # (n, 10 + k, pixels), derivatives by centre, radius and depth, and the background's surfaces under the ball
+    estimator: Float  # (n, 2, pixels), what makes centres of values
     shade: Float  # (n, 1, pixels), what the ball leaves of structure in the background
     weight: Float  # (n, pixels)
     inverse: Float  # (n, 10 + k, 10 + k), of the normal matrices
@@ -162,10 +164,6 @@ class _Solution:
     ground: Float  # (n, pixels), background over its value at the centre, times the ball's image
     structure: Float  # (n, degrees), of the windows themselves
 
-    @property
-    def estimator(self) -> Float:
-        """What makes centres of values, shape (n, 2, pixels)."""
-        return np.asarray(np.matmul(self.inverse[:, :2], self.images * self.weight[:, None]))
 
 
 def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: Beside, noise: NoiseModel) -> _Windows:
@@ -236,10 +234,13 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         images = np.concatenate([np.stack([-depth[:, None] * by[0], -depth[:, None] * by[1], depth[:, None] * by[2], value], 1), curves], 1)
         left = windows.data - ball
         weight = windows.valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
-        weighted = images * weight[:, None]
-        normal, right = np.matmul(weighted, images.swapaxes(1, 2)), np.matmul(weighted, left[:, :, None])[:, :, 0]
+        root = np.sqrt(weight)[:, None]
+        whole = np.concatenate([images, left[:, None]], axis=1) * root
+        white = whiten(whole.reshape(*whole.shape[:2], 2 * half + 1, -1), noise).reshape(whole.shape)
+        seen = white[:, :-1]
+        normal, right = np.matmul(seen, seen.swapaxes(1, 2)), np.matmul(seen, white[:, -1, :, None])[:, :, 0]
         if step == 1:  # once the background is known roughly
-            own = _own_share(normal, right, precision[:, _PER_BALL:], noise.gain(np.array(float(half))), common.differ)
+            own = _own_share(normal, right, precision[:, _PER_BALL:], common.differ)
             structure = structure * own[:, None]
             precision[:, _PER_BALL:] = _precision(known, structure, fits, noise)
         normal[:, each, each] += precision
@@ -251,7 +252,9 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
         residual = left - np.matmul(change[:, None], images)[:, 0]
-    return _Solution(local, radius, images, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure)
+    estimator = np.matmul(inverse[:, :2], seen).reshape(len(depth), 2, 2 * half + 1, -1)
+    estimator = whiten(estimator, noise).reshape(len(depth), 2, -1) * root
+    return _Solution(local, radius, estimator, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure)
 
 
 def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) -> BallFits:
@@ -278,11 +281,11 @@ def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) ->
 
 
 def _precision(known: Modes, structure: Float, fits: BallFits, noise: NoiseModel) -> Float:
-    # correlated noise makes a fit surer than it is: held in the same proportion, surfaces bend as far as they should
-    return np.asarray(1 / (np.maximum(structure[:, known.degree], _NONE) * noise.variance_at(fits.background)[:, None]))
+    variance = known.noise * np.maximum(structure[:, known.degree], _NONE)
+    return np.asarray(1 / (variance * noise.variance_at(fits.background)[:, None]))
 
 
-def _own_share(normal: Float, right: Float, precision: Float, gain: Float, differ: float) -> Float:
+def _own_share(normal: Float, right: Float, precision: Float, differ: float) -> Float:
     """How many times as much structure as beside them there is in the windows of balls themselves, shape (n,).
 
     The mean over the marginal likelihood of the window, with all else fitted, times a prior by which places of a film differ.
@@ -294,7 +297,7 @@ def _own_share(normal: Float, right: Float, precision: Float, gain: Float, diffe
     value, axes = np.linalg.eigh(told)
     value = np.maximum(value, 0.0)[:, None]
     left = root * (right[:, modes] - np.matmul(fitted, right[:, rest, None])[:, :, 0])
-    square = (np.matmul(axes.swapaxes(1, 2), left[:, :, None])[:, None, :, 0]) ** 2 / gain
+    square = (np.matmul(axes.swapaxes(1, 2), left[:, :, None])[:, None, :, 0]) ** 2
     share = _SHARES[:, None]
     likelihood = 0.5 * (square * share / (1 + share * value) - np.log1p(share * value)).sum(axis=2) - 0.5 * (np.log(_SHARES) / differ) ** 2
     weight = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
@@ -305,9 +308,8 @@ def _hold(fits: BallFits, common: _Common) -> tuple[Float, Float]:
     """Return where the radius of each is held and how strongly, the inverse of a variance; not at all where it has a size of its own."""
     apart = np.abs(np.log(fits.radius_px) - common.size.log_radius)
     own = apart > _OUTLIER * np.hypot(common.size.spread, np.sqrt(fits.covariance[:, 2, 2]) / fits.radius_px)
-    gain = common.noise.gain(np.hypot(common.optics.sigma_px, 0.5 * fits.radius_px))  # as for the surfaces
     at_limit = (fits.radius_px <= RADIUS_PX[0]) | (fits.radius_px >= RADIUS_PX[1])
-    held = np.where(own, 0.0, gain / common.size.radius_sd_px**2)
+    held = np.where(own, 0.0, 1 / common.size.radius_sd_px**2)
     return np.where(at_limit, fits.radius_px, common.size.radius_px), np.where(at_limit, _FIXED, held)
 
 
@@ -320,6 +322,11 @@ def _held_over(values: NDArray[Any], near: Int, estimator: Float, known: Modes, 
     error = np.einsum("kip,kp->ki", estimator[near], values - mean[:, None])
     square = np.einsum("ki,ki->k", error, np.linalg.solve(stated[near], error[:, :, None])[:, :, 0])
     return np.asarray(square / noise.variance_at(mean) / _OF_CHANCE)
+
+
+def _least(noise: NoiseModel) -> float:
+    """Part of the promised squared errors that can be all there is: less is not believed of areas of one value, nor of white noise."""
+    return _QUIETEST if noise.is_white or noise.typical_sd**2 < _ROUNDED else _NONE
 
 
 def _variance(known: Modes, structure: Float) -> Float:

@@ -22,6 +22,7 @@ _FARTHER = (1.0, 1.5, 2.2)  # distances, in units of the nearest one that is fre
 _DEGREES = range(3, 7)  # of surfaces beyond the quadratic one; finer ones do not look like a shift of the ball
 _LEAST_DIFFER = 0.2  # of structure from window to window
 _LEAST = 4  # free places from which a ball's surroundings tell something
+_SURE = 2.0  # standard deviations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +184,7 @@ def around_each(figures: list[Float], places: list[Places], count: int, least: f
     count : int
         Of balls.
     least : float
-        Smaller figures are chance.
+        Smaller figures are none.
     quantile : float
         0.5: the median.
 
@@ -205,8 +206,12 @@ def around_each(figures: list[Float], places: list[Places], count: int, least: f
     enough = np.isfinite(error[:, 0])
     if not enough.any():
         return np.ones((count, width))
-    usual = np.quantile(np.concatenate(logs), quantile, axis=0)
+    together = np.concatenate(logs)
+    sure = min(quantile + _SURE * np.sqrt(quantile * (1 - quantile) / len(together)), 1.0)
+    usual, high = np.quantile(together, [quantile, sure], axis=0)
+    caution = np.maximum(np.minimum(high, 0.0) - usual, 0.0)  # less than was promised is believed as far as it cannot be chance
     usual_error = error[enough].mean(axis=0)
     between = np.maximum(np.square(own[enough] - usual).mean(axis=0) - usual_error, 0.0)
     weight = between / np.maximum(between + usual_error, 1e-30) * enough[:, None]
-    return np.asarray(np.exp(usual + weight * (np.where(enough[:, None], own, usual) - usual)))
+    own = np.maximum(own, np.minimum(usual, 0.0))  # an area of one value says nothing of a ball in it
+    return np.asarray(np.exp(usual + caution + weight * (np.where(enough[:, None], own, usual) - usual)))

@@ -1,0 +1,56 @@
+"""Noise of neighbouring pixels made independent, for fits that are efficient where screens and scanners blur the noise.
+
+Least squares with weights alone stays unbiased in correlated noise but loses to generalised least squares (Aitken, Proceedings of the
+Royal Society of Edinburgh 55, 1935): a filter with the inverse root of the noise's power spectrum on data and model alike. Its matrix over
+a window, with nothing beyond, comes to the inverse of the covariance to a few per cent in the errors of centres.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.types import Float
+
+_REACH = 4  # pixels; a longer filter does no better
+_PERIOD = 64
+_LEAST_POWER = 0.1  # of white noise of the same variance: no frequency is known to have less, and blur is not known so well
+
+
+def whiten(images: Float, noise: NoiseModel) -> Float:
+    """Filter windows so that the film's noise in them is white, of variance one if it was.
+
+    Parameters
+    ----------
+    images : ndarray of shape (..., s, s)
+        In units of the noise of each pixel; 0 where masked.
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of shape (..., s, s)
+        The filter is its own transpose.
+    """
+    if noise.is_white:
+        return images
+    side = images.shape[-1]
+    rows = images.reshape(-1, side, side)
+    apart = np.zeros((len(rows), side + _REACH, side))
+    apart[:, :side] = rows
+    kernel = _kernel(noise.correlation.tobytes(), len(noise.correlation))
+    out = cv2.filter2D(apart.reshape(-1, side), cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(out.reshape(apart.shape)[:, :side].reshape(images.shape))
+
+
+@lru_cache(maxsize=64)
+def _kernel(correlation: bytes, side: int) -> NDArray[np.float64]:
+    wrapped = np.zeros((_PERIOD, _PERIOD))
+    wrapped[:side, :side] = np.frombuffer(correlation).reshape(side, side)
+    power = np.fft.rfft2(np.roll(wrapped, (-(side // 2), -(side // 2)), (0, 1))).real
+    power += max(0.0, _LEAST_POWER - power.min())
+    kernel = np.fft.irfft2(1 / np.sqrt(power), s=wrapped.shape)
+    return np.asarray(np.roll(kernel, (_REACH, _REACH), (0, 1))[: 2 * _REACH + 1, : 2 * _REACH + 1].copy())
