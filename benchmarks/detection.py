@@ -292,7 +292,7 @@ def main() -> None:
         ),
         1,
     )
-    noises = run((({"noise": n, "CNR": c}, Case("ball", 4.0, c, noise=n)) for n in ("quantum", "screen") for c in cnrs), films)
+    noises = run((({"noise": n, "CNR": c}, Case("ball", 4.0, c, noise=n)) for n in ("quantum", "screen", "fine scan") for c in cnrs), films)
     pins = {
         shape: run(
             (

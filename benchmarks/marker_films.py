@@ -28,7 +28,8 @@ PRIMARY = 0.5  # of the exposure; the rest is scatter, which no marker stops: no
 TANTALUM_MM = 0.8  # diameter of the balls: their attenuation is 8 per mm at every pitch
 PER_MM = 8.0
 PIN_HALF_MM, PIN_LENGTH_MM = 0.25, 2.0  # of cage 1A
-SCREEN_PX, SCREEN_PART = 0.8, 0.8  # correlated noise: blur of its screen part, and that part of its variance; the rest is white
+# correlated noise: blur of its screen part in pixels, and that part of its variance; the rest is white
+SCREENS = {"screen": (0.8, 0.8), "fine scan": (1.2, 0.95)}
 EXPOSURE = (0.6, 0.95)  # darkest and brightest background
 PHASE = (0.23, -0.31)  # where in its pixel a mark lies whose bound is calculated; the bound hardly depends on it
 
@@ -46,7 +47,8 @@ class Case:
     cnr : float
         Largest departure of a mark from a background of exposure 0.8, over the standard deviation of one pixel there.
     background, noise : str
-        ``flat``, ``gradient``, ``bone``; ``white``, ``quantum`` (variance goes with the exposure), ``screen`` (that, and correlated).
+        ``flat``, ``gradient``, ``bone``; ``white``, ``quantum`` (variance goes with the exposure), ``screen`` (that, and correlated),
+        ``fine scan`` (as blurred as the picture: a film scanned finer than its screen resolves).
     apart : float
         Of the balls of a pair, in diameters.
     companions : bool
@@ -184,11 +186,11 @@ VARIANTS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 
 
-@lru_cache(maxsize=16)
-def _screen_covariance(n: int) -> Float:
+def _screen_covariance(n: int, noise: str) -> Float:
+    blur_px, part = SCREENS[noise]
     grid = np.stack(np.meshgrid(np.arange(n), np.arange(n), indexing="ij"), -1).reshape(-1, 2)
     square = ((grid[:, None] - grid[None]) ** 2).sum(-1)
-    return SCREEN_PART * np.exp(-square / (4 * SCREEN_PX**2)) + (1 - SCREEN_PART) * (square == 0)
+    return part * np.exp(-square / (4 * blur_px**2)) + (1 - part) * (square == 0)
 
 
 def bounds(
@@ -211,7 +213,7 @@ def bounds(
         columns = [-PRIMARY * level * d[key] for key in ("col", "row", *free)]
         columns += [d["value"], clear, clear * col, clear * row]
         jacobian = np.stack([slope * c for c in columns]).reshape(len(columns), -1) / np.sqrt(variance).ravel()
-        information = jacobian @ (_whitened(jacobian, len(d["value"])) if case.noise == "screen" else jacobian.T)
+        information = jacobian @ (_whitened(jacobian, len(d["value"]), case.noise) if case.noise in SCREENS else jacobian.T)
         scale = 1 / np.sqrt(np.diag(information))
         covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
         first = covariance[:2, :2]
@@ -223,13 +225,13 @@ def bounds(
     return out
 
 
-def _whitened(jacobian: Float, n: int) -> Float:
-    return np.asarray(cho_solve(_screen_factor(n), jacobian.T))
+def _whitened(jacobian: Float, n: int, noise: str) -> Float:
+    return np.asarray(cho_solve(_screen_factor(n, noise), jacobian.T))
 
 
 @lru_cache(maxsize=4)
-def _screen_factor(n: int) -> tuple[Float, bool]:
-    factor: tuple[Float, bool] = cho_factor(_screen_covariance(n) + 1e-9 * np.eye(n * n))
+def _screen_factor(n: int, noise: str) -> tuple[Float, bool]:
+    factor: tuple[Float, bool] = cho_factor(_screen_covariance(n, noise) + 1e-9 * np.eye(n * n))
     return factor
 
 
@@ -326,9 +328,10 @@ def _nominal(case: Case, turn: float, size: float) -> tuple[float, ...]:
 
 def _stored(case: Case, scanner: Scanner, exposure: Float, sd: float, rng: np.random.Generator) -> NDArray[np.uint8] | NDArray[np.uint16]:
     noise = rng.standard_normal(exposure.shape, dtype=np.float32)
-    if case.noise == "screen":
-        screen = gaussian_filter(noise, SCREEN_PX, mode="wrap") * (2 * SCREEN_PX * math.sqrt(np.pi))
-        noise = math.sqrt(SCREEN_PART) * screen + math.sqrt(1 - SCREEN_PART) * rng.standard_normal(noise.shape, dtype=np.float32)
+    if case.noise in SCREENS:
+        blur_px, part = SCREENS[case.noise]
+        screen = gaussian_filter(noise, blur_px, mode="wrap") * (2 * blur_px * math.sqrt(np.pi))
+        noise = math.sqrt(part) * screen + math.sqrt(1 - part) * rng.standard_normal(noise.shape, dtype=np.float32)
     if case.noise == "white":
         signal = scanner.signal(exposure) + sd * noise
     else:

@@ -16,6 +16,7 @@ from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.profiles import ball_table
+from rsa_vision.detect.whitening import whiten
 from rsa_vision.types import Float
 
 _STEPS = 25
@@ -67,7 +68,7 @@ def fit_group(
         surface = np.column_stack([surface, edge_profile(data - images.value.T @ theta[:k], valid, sigma_px)])
         images = _images(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-6)
-    converged = False
+    converged, before = False, np.zeros((3, k))
     for step in range(_STEPS + 1):
         value, linear, jac = images.value, images.linear, images.jacobian(theta)
         residual = data - linear @ theta
@@ -78,13 +79,18 @@ def fit_group(
         delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 6 else 1e-7)
         move = delta[: 3 * k].reshape(3, k)
         scale = min(1.0, 0.5 / max(float(np.abs(move).max()), 1e-9))
+        if (move * before).sum() < 0:  # too far: without this faint pairs go to and fro for ever
+            scale *= 0.5
+        before = move
         local = local + scale * move[:2].T
         radius = np.clip(radius + scale * move[2], low, high)
         converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
         images = _images(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-9)
     root = np.sqrt(weight)[:, None]
-    influence = np.concatenate([_estimator(jac * root)[: 4 * k], _estimator(linear * root)[:k]]).reshape(5 * k, size, size)
+    estimator = _estimator(jac * root, size, noise)[: 4 * k]
+    last = (estimator @ (residual * root[:, 0])).reshape(4, k)
+    influence = np.concatenate([estimator, _estimator(linear * root, size, noise)[:k]]).reshape(5 * k, size, size)
     whole = influence_covariance(influence, noise.correlation)
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
     core = distance < (radius + sigma_px)[:, None]
@@ -94,9 +100,9 @@ def fit_group(
     raised = weight * (residual + theta[:k, None] * value) ** 2
     own = [[i, k + i, 2 * k + i, 3 * k + i] for i in range(k)]
     return BallFits(
-        position_px=local + window.corner_px,
-        radius_px=radius,
-        depth=theta[:k],
+        position_px=local + last[:2].T + window.corner_px,
+        radius_px=np.clip(radius + last[2], low, high),
+        depth=theta[:k] + last[3],
         covariance=np.stack([whole[np.ix_(index, index)] for index in own]),
         chi2_core=(square * core).sum(1) / inside,
         chi2_ring=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight * ring, distance.shape), local, size, ~core),
@@ -112,9 +118,11 @@ def fit_group(
     )
 
 
-def _estimator(weighted: Float) -> Float:
-    """Linear estimator (p, n) of the parameters whose weighted derivatives are (n, p)."""
-    return np.asarray(invert((weighted.T @ weighted)[None])[0] @ weighted.T)
+def _estimator(weighted: Float, size: int, noise: NoiseModel) -> Float:
+    """Linear estimator (p, n) of the parameters whose derivatives are (n, p), in units of the noise as the values are."""
+    white = whiten(weighted.T.reshape(-1, size, size), noise).reshape(weighted.T.shape)
+    to_white = invert((white @ white.T)[None])[0] @ white
+    return whiten(to_white.reshape(-1, size, size), noise).reshape(white.shape)
 
 
 def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None) -> float:

@@ -165,7 +165,6 @@ class _Solution:
     structure: Float  # (n, degrees), of the windows themselves
 
 
-
 def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: Beside, noise: NoiseModel) -> _Windows:
     fits = balls.rows(part)
     patches = cut(film, fits.position_px, half, noise)
