@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.noise import LAGS, NoiseModel
@@ -25,17 +24,21 @@ def _model(sigma_px: float, part: float) -> NoiseModel:
     return NoiseModel(np.zeros(1), np.ones(1), correlation, -np.inf, np.inf)
 
 
-def _noise(sigma_px: float, part: float, shape: tuple[int, ...], rng: np.random.Generator) -> Float:
-    blurred = gaussian_filter(rng.standard_normal(shape), (0, sigma_px, sigma_px), mode="wrap")
-    return np.asarray(np.sqrt(part) * blurred / blurred.std() + np.sqrt(1 - part) * rng.standard_normal(shape))
+def _noise(sigma_px: float, part: float, shape: tuple[int, int, int], rng: np.random.Generator) -> Float:
+    """Noise of variance one with just the correlation of the model."""
+    rows, cols = (np.minimum(np.arange(n), n - np.arange(n)) for n in shape[1:])
+    square = (rows[:, None] ** 2 + cols**2).astype(float)
+    correlation = part * np.exp(-square / (4 * sigma_px**2)) + (1 - part) * (square == 0)
+    power = np.maximum(np.fft.rfft2(correlation).real, 0.0)
+    return np.fft.irfft2(np.fft.rfft2(rng.standard_normal(shape)) * np.sqrt(power), s=shape[1:])
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.floats(0.7, 1.2), st.floats(0.3, 0.9), st.integers(0, 100))
+@given(st.floats(0.5, 1.2), st.floats(0.3, 0.9), st.integers(0, 100))
 def test_blurred_noise_comes_out_white(sigma_px: float, part: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     white = whiten(_noise(sigma_px, part, (60, 64, 64), rng), _model(sigma_px, part))[:, 8:-8, 8:-8]
-    assert white.var() == pytest.approx(1.0, abs=0.05)
+    assert 0.9 < white.var() < 1.03  # less where the model's correlations, cut off, would have a frequency of too little power
     for lag in (1, 2, 3):
         assert abs((white[:, lag:] * white[:, :-lag]).mean()) < 0.05
         assert abs((white[:, lag:, lag:] * white[:, :-lag, :-lag]).mean()) < 0.05
