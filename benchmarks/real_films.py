@@ -8,10 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from epipolar import scatter
 from numpy.typing import NDArray
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.images import read_film
+from rsa_vision.types import MarkerImages
 
 Float = NDArray[np.float64]
 Rows = list[dict[str, object]]
@@ -19,9 +21,13 @@ NEAR_PX = 2.0
 MIDDLE_PX = 20.0  # the ball of a Winston-Lutz film lies this near to the isocentre, the film's middle
 
 
-def _found(path: Path) -> Float:
+def _images(path: Path) -> MarkerImages:
     film = read_film(path)
-    return detect_markers(film.values, bits=film.bits).images.position_px
+    return detect_markers(film.values, bits=film.bits).images
+
+
+def _found(path: Path) -> Float:
+    return _images(path).position_px
 
 
 def _labels(path: Path) -> list[dict[str, str]]:
@@ -46,19 +52,33 @@ def _point(row: dict[str, str], view: int) -> list[float]:
 def _pig(folder: Path) -> Rows:
     rows = _labels(folder / "labels.csv")
     hits, total, extra, distances = 0, 0, [], []
+    labels, points, stated = [], [], []  # of either view, every frame
     for path in sorted(folder.glob("pig_*_f?.png")):
         frame, view = (int(v) for v in re.findall(r"_(\d+)_f(\d)", path.name)[0])
         truth = np.array([_point(r, view) for r in rows if int(r["frame"]) == frame])
-        nearest, distance, more = _match(truth, _found(path))
+        images = _images(path)
+        nearest, distance, more = _match(truth, images.position_px)
         hits, total = hits + int((nearest >= 0).sum()), total + len(truth)
         extra.append(more)
         distances += distance[nearest >= 0].tolist()
+        labels.append(truth)
+        points.append(np.where(nearest[:, None] >= 0, images.position_px[nearest], np.nan))
+        stated.append(images.covariance_px2[nearest])
+
+    def between(of: list[Float], covariance: list[Float] | None = None) -> float:
+        both = np.isfinite(np.concatenate(points[::2]) + np.concatenate(points[1::2])).all(axis=1)
+        unit = [np.tile(np.eye(2), (len(o), 1, 1)) for o in of]
+        views = [np.concatenate(x[k::2])[both] for x in (of, covariance or unit) for k in (0, 1)]
+        return scatter(*views)
+
     return [
         {
             "films": "pig",
             "found": f"{hits} of {total} ({100 * hits / total:.1f} %)",
             "more than labelled, by film": ", ".join(map(str, extra)),
             "median distance to the labels, px": f"{np.median(distances):.2f}",
+            "SD about the epipolar geometry, px": f"{between(points):.3f} (labels {between(labels):.3f})",
+            "the same over what is stated": f"{between(points, stated):.2f}",
         }
     ]
 
