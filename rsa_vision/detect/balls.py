@@ -11,6 +11,7 @@ from rsa_vision.detect.ball_equations import invert, pixels_of, polynomial, weig
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import Patches
 from rsa_vision.detect.profiles import BallTable, Optics, ball_table
+from rsa_vision.detect.whitening import whiten
 from rsa_vision.types import Bool, Float, Int
 
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are what is looked for
@@ -39,8 +40,8 @@ class BallFits:
         Mean squared residual in units of the noise variance, under the ball (to one blur beyond the rim) and around it; the latter of the
         odd part only, as below.
     chi2_uneven : ndarray of shape (n,)
-        As ``chi2_core``, of the odd part of the residuals only: errors that are the same on opposite sides of the centre (film curve, focal
-        spot, attenuation) do not move it.
+        As ``chi2_core``, the noise made white, of the odd part of the residuals only: errors that are the same on opposite sides of the
+        centre (film curve, focal spot, attenuation) do not move it.
     explained : ndarray of shape (n,)
         Fraction of the excess variance under the ball, over a background without ball, that the ball explains (1: all).
     valid_fraction : ndarray of shape (n,)
@@ -220,7 +221,9 @@ def fit_balls(
         scatter = influence_covariance(influence[:, :, pixels.back].reshape(n, 5, size, size), noise.correlation)
         covariance, variance = scatter[:, :4, :4], scatter[:, 4, 4]
         under = np.pad(core, ((0, 0), (0, size * size - reached)))[:, pixels.back]
-        chi2_ring, chi2_uneven = (uneven(residual[:, pixels.back], weight[:, pixels.back], local, size, part) for part in (~under, under))
+        all_left, all_weight = residual[:, pixels.back], weight[:, pixels.back]
+        chi2_ring = uneven(all_left, all_weight, local, size, ~under)
+        chi2_uneven = uneven_white(all_left, all_weight, local, size, under, noise)
     return BallFits(
         position_px=local + patches.corner_px,
         radius_px=radius,
@@ -261,6 +264,12 @@ def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) 
     odd = residual - np.take_along_axis(residual, opposite, 1)
     out: Float = (0.5 * pairs * weight * odd**2).sum(1) / np.maximum(pairs.sum(1) - 4, 1.0)
     return out
+
+
+def uneven_white(residual: Float, weight: Float, local: Float, size: int, core: Bool, noise: NoiseModel) -> Float:
+    """Return the same of residuals whose noise is made white first: by what errors of centres come of."""
+    white = whiten((residual * np.sqrt(weight)).reshape(-1, size, size), noise).reshape(residual.shape)
+    return uneven(white, (weight > 0).astype(np.float64), local, size, core)
 
 
 def _distance(dx: Float, dy: Float) -> Float:

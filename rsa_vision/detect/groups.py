@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, uneven
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, uneven, uneven_white
 from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
@@ -97,6 +97,7 @@ def fit_group(
     square = weight * residual**2
     ring = valid * ~core.any(0)
     inside = np.maximum((core * valid).sum(1), 1.0)
+    of_all = np.broadcast_to(residual, distance.shape)
     raised = weight * (residual + theta[:k, None] * value) ** 2
     own = [[i, k + i, 2 * k + i, 3 * k + i] for i in range(k)]
     return BallFits(
@@ -105,8 +106,8 @@ def fit_group(
         depth=theta[:k] + last[3],
         covariance=np.stack([whole[np.ix_(index, index)] for index in own]),
         chi2_core=(square * core).sum(1) / inside,
-        chi2_ring=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight * ring, distance.shape), local, size, ~core),
-        chi2_uneven=uneven(np.broadcast_to(residual, distance.shape), np.broadcast_to(weight, distance.shape), local, size, core),
+        chi2_ring=uneven(of_all, np.broadcast_to(weight * ring, of_all.shape), local, size, ~core),
+        chi2_uneven=uneven_white(of_all, np.broadcast_to(weight, of_all.shape), local, size, core, noise),
         explained=1 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
         valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
         window_fraction=np.full(k, valid.mean()),

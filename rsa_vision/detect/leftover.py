@@ -8,7 +8,8 @@ from rsa_vision.detect.balls import derivatives, half_size
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.surroundings import Places
-from rsa_vision.types import Float
+from rsa_vision.detect.whitening import whiten
+from rsa_vision.types import Bool, Float
 
 _FITTED = 4  # parameters that ``uneven`` counts off
 _AT_RIM = 0.7  # the rim, which tells the centre, lies at half the depth; the mean of all that is under a ball at seven tenths
@@ -58,10 +59,16 @@ def _uneven(places: Places, radius_px: float, quiet: float, optics: Optics, nois
     """Mean squares of the odd part of what the fit of a ball leaves of quiet places, under where the ball would be."""
     half = places.half
     basis = np.linalg.qr(derivatives(np.array([radius_px]), half, optics.sigma_px, optics.mu_px)[0].T)[0]
-    values = places.values - places.values.mean(axis=1, keepdims=True)
+    level = places.values.mean(axis=1, keepdims=True)
+    values = (places.values - level) / np.sqrt(noise.variance_at(level))
     rest = values - (values @ basis) @ basis.T
-    odd = np.square(rest - rest[:, ::-1]) / (2 * noise.variance_at(places.values.mean(axis=1)))[:, None]  # windows are symmetric
+    white = whiten(rest.reshape(-1, 2 * half + 1, 2 * half + 1), noise).reshape(rest.shape)
     rows, cols = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
     core = np.hypot(cols, rows) < radius_px + optics.sigma_px
-    under, ring = (odd[:, where].sum(axis=1) / max(np.count_nonzero(where) - _FITTED, 1) for where in (core, ~core))
+    under, ring = (_odd(left, where) for left, where in ((white, core), (rest, ~core)))
     return np.asarray(under[ring < quiet])
+
+
+def _odd(left: Float, where: Bool) -> Float:
+    square = 0.5 * np.square(left - left[:, ::-1])  # windows are symmetric
+    return np.asarray(square[:, where].sum(axis=1) / max(np.count_nonzero(where) - _FITTED, 1))

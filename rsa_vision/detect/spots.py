@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, slopes, uneven
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, slopes, uneven, uneven_white
 from rsa_vision.detect.decide import LEAST_KNOWN, SURE, over_clutter
 from rsa_vision.detect.find import DOUBTFUL, MISFIT, misfit, plausible
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
@@ -256,7 +256,7 @@ def _table(w: _Window, s: _State, odd: BallFits, optics: Optics, noise: NoiseMod
     counted = np.maximum(seen, 1.0)
     bare = np.where(root > 0, residual / np.where(root > 0, root, 1.0), 0.0)
     raised = weight * (bare + depth[:, None] * e.value) ** 2
-    ring, under = (uneven(bare, weight, s.local, side, part) for part in (~core, core))
+    ring, under = uneven(bare, weight, s.local, side, ~core), uneven_white(bare, weight, s.local, side, core, noise)
     return replace(
         odd,
         position_px=s.local + w.corner,
