@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, slopes, uneven, uneven_white
+from rsa_vision.detect.balls import RADIUS_PX, BallFits, slopes, uneven_white
 from rsa_vision.detect.decide import EDGE
 from rsa_vision.detect.find import CHANCE
 from rsa_vision.detect.foreign import foreign, in_line, robust_residual
@@ -273,8 +273,7 @@ def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) ->
     rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1)
     distance = np.hypot(cols - found.local_px[:, :1], rows - found.local_px[:, 1:])
     core = distance < (found.radius_px + common.optics.sigma_px)[:, None]
-    under = uneven_white(found.residual, found.weight, found.local_px, side, core, common.noise)
-    ring = uneven(found.residual, found.weight, found.local_px, side, ~core)
+    under, ring = (uneven_white(found.residual, found.weight, found.local_px, side, where, common.noise) for where in (core, ~core))
     left = (found.weight * found.residual**2 * core).sum(axis=1) / np.maximum((core & (found.weight > 0)).sum(axis=1), 1)
     position = found.local_px + windows.corner_px
     return replace(fits, position_px=position, covariance=covariance, chi2_core=left, chi2_uneven=under, chi2_ring=ring)
