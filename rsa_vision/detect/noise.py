@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
-from scipy.signal import convolve2d
-from scipy.special import chdtr, chdtri
+from scipy.special import chdtri
 
 from rsa_vision.types import Float
 
@@ -29,7 +28,6 @@ _QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
 _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
 _ROUNDED = 0.1  # of that: less is left by no noise
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
-_ROUNDS = 3  # of a fixed point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,8 +169,7 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])
     noisy = chosen[variance[chosen] > _ROUNDED * _QUANTISATION]  # areas of one value say nothing of neighbours
     correlation, hidden = _correlation(rest[noisy], variance[noisy])
-    correlation = _of_all_tiles(correlation, dof)
-    independent = dof / float((correlation**2).sum())
+    independent = dof / max(float((correlation**2).sum()), 1.0)
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
@@ -257,21 +254,6 @@ def _smooth_correlation(auto: Float) -> tuple[Float, float]:
     correlation = part * np.exp(-square / (4 * sigma**2))
     correlation[LAGS, LAGS] = 1.0
     return correlation, beta
-
-
-def _of_all_tiles(of_quiet: Float, dof: int) -> Float:
-    """Return the correlation in all tiles, given that in the quiet quarter of them: these are quiet since low frequencies lack in them.
-
-    Given the variance of a tile, each frequency is expected to lack in proportion to its share of the variance of that (the regression of
-    independent exponential variables on their sum); all together lack what the quiet quarter of chi-square variables does.
-    """
-    correlation = of_quiet
-    for _ in range(_ROUNDS):
-        total = float((correlation**2).sum())
-        independent = dof / total
-        lack = 1 - float(chdtr(independent + 2, chdtri(independent, 0.75))) / 0.25
-        correlation = (1 - lack) * of_quiet + lack * convolve2d(correlation, correlation, mode="same") / total
-    return np.asarray(correlation)
 
 
 def influence_covariance(influence: Float, correlation: Float) -> Float:
