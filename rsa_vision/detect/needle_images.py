@@ -6,9 +6,11 @@ Here the tip is a parameter of the image.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,7 @@ CELL = 0.3  # pixels between the nodes of a needle table
 GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
-_PAD = 5.0  # blur widths around the needle that a table covers
+_PAD = 4.0  # blur widths beyond the outline where nothing is left that noise would let be seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +136,8 @@ def _opacity(
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
     """Return where the grid of a table begins along and across the needle, and how many nodes it has."""
     pad = _PAD * sigma
-    half = int(np.ceil((half_width + pad) / CELL))
-    return (-pad, -half * CELL), (int(np.ceil((length + 2 * pad) / CELL)) + 1, 2 * half + 1)
+    half = math.ceil((half_width + pad) / CELL)
+    return (-pad, -half * CELL), (math.ceil((length + 2 * pad) / CELL) + 1, 2 * half + 1)
 
 
 @lru_cache(maxsize=256)
@@ -161,28 +163,23 @@ def _table(
     return table
 
 
-def _look_up(table: NDArray[np.float32], first: tuple[float, float], s: Float, p: Float) -> NDArray[np.float32]:
-    """Interpolate all columns of a table bilinearly; 0 beyond it. Single precision is far finer than the tables."""
-    _, n_s, n_p = table.shape
-    at_s, at_p = ((x - start).astype(np.float32) * np.float32(1 / CELL) for x, start in zip((s, p), first, strict=True))
-    for at, last in ((at_s, n_s - 1.01), (at_p, n_p - 1.01)):
-        np.maximum(at, 0.0, out=at)
-        np.minimum(at, np.float32(last), out=at)
-    low_s, low_p = at_s.astype(np.int32), at_p.astype(np.int32)
-    at_s -= low_s
-    at_p -= low_p
-    node = (low_s * n_p + low_p).astype(np.intp)
+def _look_up(table: NDArray[np.float32], at_s: Float, at_p: Float) -> Float:
+    """Interpolate all columns of a table bilinearly at these places in units of its cells, within it; single precision is far finer."""
+    n_p = table.shape[2]
+    low_s, low_p = at_s.astype(np.intp), at_p.astype(np.intp)
+    part_s, part_p = (at_s - low_s).astype(np.float32), (at_p - low_p).astype(np.float32)
+    node = low_s * n_p + low_p
     nodes = table.reshape(len(table), -1)
     near: NDArray[np.float32] = nodes.take(node, axis=1)
     beside, far, across = (nodes.take(node + step, axis=1) for step in (1, n_p, n_p + 1))
     for low, high in ((near, beside), (far, across)):
         high -= low
-        high *= at_p
+        high *= part_p
         low += high
     far -= near
-    far *= at_s
+    far *= part_s
     near += far
-    return near
+    return near.astype(np.float64)
 
 
 def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
@@ -213,27 +210,38 @@ def arm_images(
     logarithms of attenuation and blur, and the taper.
     """
     # tables stand on a grid of shapes, shared by all needles of a film, and are stretched; what else a size changes is linear in between
-    half_width, length = (round(GRID ** np.floor(np.log(size) / np.log(GRID)), 4) for size in (shape.half_width_px, shape.length_px))
+    half_width, length = (round(GRID ** math.floor(math.log(size) / math.log(GRID)), 4) for size in (shape.half_width_px, shape.length_px))
     wider, longer = shape.half_width_px / half_width, shape.length_px / length
     film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
-    key, first = (half_width, length, round(shape.taper, 3), *film), _grid(half_width, length, film[0])[0]
+    key, (first, nodes) = (half_width, length, round(shape.taper, 3), *film), _grid(half_width, length, film[0])
     c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
-    along, across = dx * c + dy * s, dy * c - dx * s
-    at = along / longer, across / wider
+    (n_s, n_p), unit_s, unit_p = nodes, CELL * longer, CELL * wider
+    at_s = dx * (c / unit_s) + (dy * (s / unit_s) - first[0] / CELL)
+    at_p = dy * (c / unit_p) - (dx * (s / unit_p) + first[1] / CELL)
+    # most pixels see one arm only: beyond its table an arm is nothing
+    seen = np.flatnonzero((np.abs(at_s - (n_s - 1) / 2) < (n_s - 1) / 2) & (np.abs(at_p - (n_p - 1) / 2) < (n_p - 1) / 2))
+    arm, at_s, at_p = seen // len(dx), at_s.ravel()[seen], at_p.ravel()[seen]
     if slants is None:
-        columns = _look_up(_table(*key, 0.0, "optics" if by_optics else ""), first, *at)
+        columns = _look_up(_table(*key, 0.0, "optics" if by_optics else ""), at_s, at_p)
     else:
         off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
         steps = np.round(slants[0] - off_q, 4).tolist()
-        columns = np.stack([_look_up(_table(*key, q, "ends"), first, a, b) for q, a, b in zip(steps, *at, strict=True)], axis=1)
-    value, g_s, g_p, more_w, more_l, *more = columns.astype(np.float64)
+        ends = np.searchsorted(arm, np.arange(len(steps) + 1))
+        parts = [slice(*of_arm) for of_arm in pairwise(ends)]
+        columns = np.concatenate([_look_up(_table(*key, q, "ends"), at_s[i], at_p[i]) for q, i in zip(steps, parts, strict=True)], axis=1)
+    value, g_s, g_p, more_w, more_l, *more = columns
     value += (shape.half_width_px - half_width) * more_w + (shape.length_px - length) * more_l
     if slants is not None:
-        value += off_q[:, None] * more[0] + slants[1][:, None] * more[1]
+        value += off_q[arm] * more[0] + slants[1][arm] * more[1]
+    along, across = (at_s + first[0] / CELL) * unit_s, (at_p + first[1] / CELL) * unit_p
+    c, s = c.ravel()[arm], s.ravel()[arm]
     g_s, g_p = g_s / longer, g_p / wider
     d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
     by_size = [more_w - g_p * across / shape.half_width_px, more_l - g_s * along / shape.length_px]
-    return np.array([value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more])
+    out = np.zeros((len(columns) + 1, len(angles) * len(dx)))
+    for row, told in zip(out, (value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more), strict=True):
+        row[seen] = told
+    return out.reshape(len(out), len(angles), -1)
 
 
 def support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:

@@ -18,6 +18,7 @@ from rsa_vision.types import Bool, Float
 _STEPS = 14
 _CONVERGED_PX = 5e-4
 _CLOSE_PX = 0.03
+PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
 STANDS_OUT = 15.0  # significance from which noise may hide the form: what is chosen of a film's places stands out less
 
 
@@ -98,7 +99,7 @@ def fit_needles(
         if np.hypot(*(tip - tip_px)) > 0.6 * half:
             return _unfit(tip, angles, shape)
     image = depths @ value
-    ring = ~_under(image)
+    ring = ~under(image)
     background = float(theta[n_depth])
     free = len(theta) + 4 + (1 if rigid else k)
     fit = replace(
@@ -135,7 +136,7 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
     """
     square = weight * residual**2
     depth = float(fit.depths.mean())
-    core = _under(image)
+    core = under(image)
     n_core = int(core.sum())
     left = float(square[core].sum())
     raised = float((weight * (residual + image) ** 2)[core].sum())
@@ -154,7 +155,7 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
     )
 
 
-def _under(image: Float) -> Bool:
+def under(image: Float) -> Bool:
     """Pixels (n,) under the arms of an image."""
     return np.asarray(np.abs(image) > 0.08 * max(float(np.abs(image).max(initial=0.0)), 1e-9))
 

@@ -15,9 +15,10 @@ from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear
-from rsa_vision.detect.find import DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
+from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.spots import find_spot, with_spot
 from rsa_vision.types import Bool, Float, Int
@@ -44,7 +45,7 @@ def resolve_balls(
     limit: float,
     optics: Optics,
     noise: NoiseModel,
-    tees: Background | None,
+    tees: Painted | None,
 ) -> tuple[BallFits, Bool, Bool, Bool]:
     """Fit all balls of a film.
 
@@ -59,7 +60,7 @@ def resolve_balls(
         Significance that a mark must have.
     optics : Optics
     noise : NoiseModel
-    tees : callable, optional
+    tees : Painted, optional
         Images of pins and tees, to be subtracted.
 
     Returns
@@ -73,6 +74,10 @@ def resolve_balls(
     drawn : ndarray of bool, shape (n,)
         Fitted with the film's focal spot.
     """
+    shows_balls = np.count_nonzero(look_clear(seeds, noise)) >= LEAST_KNOWN
+    seeds = seeds.rows(~hopeless(seeds, COARSE_SIGMA_PX, noise))
+    if tees is not None and shows_balls:  # else what lies on needles too is asked what a ball may be like
+        seeds = seeds.rows(~tees.explain(film, seeds.position_px, seeds.radius_px))
     if len(seeds.depth) == 0:
         return seeds, np.zeros(0, bool), np.zeros(0, bool), np.zeros(0, bool)
     needles = tees
@@ -140,13 +145,14 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
     is added to the stated error, since edges bend and have other profiles than the model's.
     """
     parts, edged_too = [fits.rows(slice(0))], []
+    worth = ~hopeless(fits, optics.sigma_px, noise)
     for g in _groups(fits, optics):
         index = np.array(g)
         edged_too.append(np.zeros(len(g), bool))
         beside = _beside(fits, index, optics, tees)
         plain = fits.rows(index)
         # a size at the limit is not fitted: nothing that comes to rest there is a ball
-        if len(g) > _MOST_IN_GROUP or (plain.radius_px >= RADIUS_PX[1]).any():
+        if len(g) > _MOST_IN_GROUP or not worth[index].any() or (plain.radius_px >= RADIUS_PX[1]).any():
             parts.append(plain)
             continue
         start, radius = plain.position_px, plain.radius_px

@@ -20,7 +20,7 @@ from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared
-from rsa_vision.detect.templates import SCALE, find_like, template_of
+from rsa_vision.detect.templates import SCALE, find_like, promising, template_of
 from rsa_vision.detect.twins import split_twins
 from rsa_vision.types import Float
 
@@ -60,8 +60,8 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     if not models:
         return [], [], optics
     tees = _like(film, models, optics, noise)
-    for again in (False, True):
-        tees = _distinct(fit_all(film, tees, optics, noise, again=again), models[0])
+    for _ in range(2):  # beside neighbours that were fitted, too
+        tees = _distinct(fit_all(film, tees, optics, noise, again=True), models[0])
     if under := _outshone(film, tees, models[0], optics, noise):
         tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=True), models[0])
     if not tees:
@@ -159,6 +159,8 @@ def _mean_misfit(fits: list[NeedleFit]) -> float:
 def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Starts at every place that looks like one of the models."""
     found = [find_like(film, template_of(m, optics)) for m in models]
+    # what brighter tees hide here is found once these are known
+    found = [places[promising(film, places, m, optics, noise)] for m, places in zip(models, found, strict=True)]
     model = np.repeat(np.arange(len(models)), [len(f) for f in found])
     places = np.concatenate(found)
     starts: list[NeedleFit] = []

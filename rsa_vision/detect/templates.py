@@ -13,9 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.needle_images import NeedleFit, needle_image
+from rsa_vision.detect.ball_equations import polynomial
+from rsa_vision.detect.needle_images import NeedleFit, needle_image, support
+from rsa_vision.detect.needles import PROMISING, under
+from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Float
+from rsa_vision.types import Bool, Float
 
 LIKENESS = 0.4  # correlation coefficient from which a place is worth a fit; two tees one over the other reach 0.5 to 0.7
 SCALE = 2  # the film is searched at half resolution
@@ -54,3 +57,34 @@ def find_like(film: NDArray[Any], template: NDArray[np.float32]) -> Float:
     centre = side // 2
     table = np.stack([(col + centre + 0.5) * SCALE - 0.5, (row + centre + 0.5) * SCALE - 0.5, likeness[row, col]], axis=1)
     return table[np.argsort(-table[:, 2])].astype(np.float64)
+
+
+def promising(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optics, noise: NoiseModel) -> Bool:
+    """Say at which places the image of a known tee, on a quadratic background, explains a part of what lies under it.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    places : ndarray of shape (n, 3)
+        As of :func:`find_like`: all of one fraction of a pixel, so that one image does for all.
+    known : NeedleFit
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    half = int(known.shape.length_px + 3 * optics.sigma_px) + 1
+    axis = np.arange(-half, half + 1)
+    row, col = np.nonzero(support(axis - 0.5, axis - 0.5, known.angles, known.shape, 3 * optics.sigma_px)) - np.array(half)
+    image = needle_image(col - 0.5, row - 0.5, known, optics)
+    cols, rows = ((np.floor(at)[:, None] + step).astype(np.intp) for at, step in zip(places.T, (col, row), strict=False))
+    values = film[rows.clip(0, film.shape[0] - 1), cols.clip(0, film.shape[1] - 1)].astype(np.float64)
+    basis = np.vstack([image, polynomial(half, col, row).T])
+    theta = values @ np.linalg.pinv(basis)
+    core = under(image)
+    residual = (values - theta @ basis)[:, core]
+    left, all_of_it = (np.square(part).mean(1) for part in (residual, residual + theta[:, :1] * image[core]))
+    alone = noise.variance_at(theta[:, 1])
+    return np.asarray((left < (1 - PROMISING) * all_of_it) | (left - alone < (1 - PROMISING) * np.maximum(all_of_it - alone, 0.0)))
