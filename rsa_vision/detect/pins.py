@@ -64,8 +64,10 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
             continue  # the same stroke, seen by another filter
         tried = np.append(tried, [[col, row]], axis=0)
         in_vain += 1
-        fits = []
+        fits: list[NeedleFit] = []
         for turn in (angle, angle + np.pi):
+            if fits and _left(fits[0]) < _CLOSE_FIT:
+                break
             start = NeedleShape(max(0.9, 0.5 * width), 1.45 * length, TAPERS[0])  # the answer fades before the tip
             tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
             fits.append(fit_needles(film, tip, np.array([turn]), start, guess, noise, quick=True))
