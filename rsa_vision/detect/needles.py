@@ -17,7 +17,7 @@ from rsa_vision.types import Bool, Float
 
 _STEPS = 14
 _CONVERGED_PX = 5e-4
-_CLOSE_PX = 0.03
+_CLOSE_PX = 0.1
 PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
 STANDS_OUT = 15.0  # significance from which noise may hide the form: what is chosen of a film's places stands out less
 
@@ -89,7 +89,7 @@ def fit_needles(
             weight = 1.0 / noise.variance_at(theta @ linear)
         jac = np.concatenate([moves, linear]).T
         delta = weighted_least_squares(jac, weight, residual, damping=1e-4 if step < 4 else 1e-7)[: len(moves)]
-        scale = min(1.0, 1.5 / max(np.abs(delta[:2]).max(), 1e-9), 0.15 / max(np.abs(delta[4:]).max(), 1e-9))
+        scale = min(1.0, (3.0 if quick else 1.5) / max(np.abs(delta[:2]).max(), 1e-9), 0.15 / max(np.abs(delta[4:]).max(), 1e-9))
         tip += scale * delta[:2]
         width = between(shape.half_width_px + between(scale * delta[2], -0.5, 0.5), 0.6, 0.3 * shape.length_px)
         longer = between(scale * delta[3], -2.0, 2.0)
