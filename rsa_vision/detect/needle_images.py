@@ -7,7 +7,7 @@ Here the tip is a parameter of the image.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
 Images = Callable[[Float, Float], Float]
 """Images of some marks at pixels (cols, rows), in film values over the background."""
@@ -141,24 +141,28 @@ def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, 
 
 
 @lru_cache(maxsize=256)
-def _table(
-    half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float, more: str
-) -> NDArray[np.float32]:
-    """Opacity, its slopes along and across, its derivatives by half width and length as the grid stretches with them, and more: first axis.
+def _table(half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float, more: str) -> NDArray[np.float32]:
+    """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
-    ``more``: "ends" for derivatives by slant and skew, "optics" for those by the logarithms of attenuation and blur and by the taper.
+    ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur and by
+    the taper, alone.
     """
     one = half_width, length, taper, sigma, mu, bend, slant
     base = _opacity(*one)
-    nodes = [(_opacity(*one, wider=GRID) - base) / ((GRID - 1) * half_width), (_opacity(*one, longer=GRID) - base) / ((GRID - 1) * length)]
+    nodes = [
+        base,
+        (_opacity(*one, wider=GRID) - base) / ((GRID - 1) * half_width),
+        (_opacity(*one, longer=GRID) - base) / ((GRID - 1) * length),
+    ]
     if more == "ends":
         nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
+    nodes += np.gradient(base, CELL)
     if more == "optics":
         factor = float(np.exp(STEP))
         dense, wide = _opacity(*one[:4], mu * factor, bend, slant), _opacity(*one, blurrier=factor)
         short = _opacity(half_width, length, taper - STEP, *one[3:])
-        nodes += [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
-    table = np.array([base, *np.gradient(base, CELL), *nodes], np.float32)
+        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
+    table = np.array(nodes, np.float32)
     table[:, [0, -1]] = table[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return table
 
@@ -196,52 +200,85 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
     -------
     ndarray of the shape of ``dx``
     """
-    values = arm_images(dx.ravel(), dy.ravel(), fit.angles, fit.shape, optics, fit.slants)[0]
-    image: Float = (fit.depths @ values).reshape(dx.shape)
+    seen = _Seen.of(dx.ravel(), dy.ravel(), fit.angles, fit.shape, optics)
+    values, _ = seen.values(fit.shape, fit.slants, slopes=False)
+    image: Float = (fit.depths @ seen.spread([values])[0]).reshape(dx.shape)
     return image
 
 
-def arm_images(
-    dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None, *, by_optics: bool = False
-) -> Float:
+def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None) -> Float:
     """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the second axis.
 
-    With slants, those by the slant and by the skew of each arm follow; instead, if asked for, those by what is common to all: the
-    logarithms of attenuation and blur, and the taper.
+    With slants, those by the slant and by the skew of each arm follow.
     """
-    # tables stand on a grid of shapes, shared by all needles of a film, and are stretched; what else a size changes is linear in between
-    half_width, length = (round(GRID ** math.floor(math.log(size) / math.log(GRID)), 4) for size in (shape.half_width_px, shape.length_px))
-    wider, longer = shape.half_width_px / half_width, shape.length_px / length
-    film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
-    key, (first, nodes) = (half_width, length, round(shape.taper, 3), *film), _grid(half_width, length, film[0])
-    c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
-    (n_s, n_p), unit_s, unit_p = nodes, CELL * longer, CELL * wider
-    at_s = dx * (c / unit_s) + (dy * (s / unit_s) - first[0] / CELL)
-    at_p = dy * (c / unit_p) - (dx * (s / unit_p) + first[1] / CELL)
-    # most pixels see one arm only: beyond its table an arm is nothing
-    seen = np.flatnonzero((np.abs(at_s - (n_s - 1) / 2) < (n_s - 1) / 2) & (np.abs(at_p - (n_p - 1) / 2) < (n_p - 1) / 2))
-    arm, at_s, at_p = seen // len(dx), at_s.ravel()[seen], at_p.ravel()[seen]
-    if slants is None:
-        columns = _look_up(_table(*key, 0.0, "optics" if by_optics else ""), at_s, at_p)
-    else:
-        off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
-        steps = np.round(slants[0] - off_q, 4).tolist()
-        ends = np.searchsorted(arm, np.arange(len(steps) + 1))
-        parts = [slice(*of_arm) for of_arm in pairwise(ends)]
-        columns = np.concatenate([_look_up(_table(*key, q, "ends"), at_s[i], at_p[i]) for q, i in zip(steps, parts, strict=True)], axis=1)
-    value, g_s, g_p, more_w, more_l, *more = columns
-    value += (shape.half_width_px - half_width) * more_w + (shape.length_px - length) * more_l
-    if slants is not None:
-        value += off_q[arm] * more[0] + slants[1][arm] * more[1]
-    along, across = (at_s + first[0] / CELL) * unit_s, (at_p + first[1] / CELL) * unit_p
-    c, s = c.ravel()[arm], s.ravel()[arm]
-    g_s, g_p = g_s / longer, g_p / wider
+    seen = _Seen.of(dx, dy, angles, shape, optics)
+    value, (more_w, more_l, *more, g_s, g_p) = seen.values(shape, slants, slopes=True)
+    along, across = (seen.at_s + seen.first[0] / CELL) * seen.cell_s, (seen.at_p + seen.first[1] / CELL) * seen.cell_p
+    c, s = np.cos(angles)[seen.arm], -np.sin(angles)[seen.arm]
+    g_s, g_p = g_s * (CELL / seen.cell_s), g_p * (CELL / seen.cell_p)
     d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
     by_size = [more_w - g_p * across / shape.half_width_px, more_l - g_s * along / shape.length_px]
-    out = np.zeros((len(columns) + 1, len(angles) * len(dx)))
-    for row, told in zip(out, (value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more), strict=True):
-        row[seen] = told
-    return out.reshape(len(out), len(angles), -1)
+    return seen.spread([value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more])
+
+
+def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> Float:
+    """Derivatives of every arm by the logarithms of attenuation and blur, and by the taper; how the ends slant hardly matters."""
+    seen = _Seen.of(dx, dy, angles, shape, optics)
+    return seen.spread(_look_up(_table(*seen.key, 0.0, "optics"), seen.at_s, seen.at_p))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Pixels at which an arm is seen: most see one at the most, and beyond its table an arm is nothing.
+
+    Tables stand on a grid of shapes, shared by all needles of a film, and are stretched; what else a size changes is linear in between.
+    """
+
+    key: tuple[float, ...]  # of the table: shape, optics
+    first: tuple[float, float]
+    cell_s: float  # stretched
+    cell_p: float
+    arm: Int
+    at_s: Float
+    at_p: Float
+    index: Int  # of arm and pixel
+    shape: tuple[int, ...]  # arms and pixels
+
+    @staticmethod
+    def of(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> _Seen:
+        half_width, length = (round(GRID ** math.floor(math.log(size) / math.log(GRID)), 4) for size in (shape.half_width_px, shape.length_px))
+        film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
+        first, (n_s, n_p) = _grid(half_width, length, film[0])
+        cell_s, cell_p = CELL * shape.length_px / length, CELL * shape.half_width_px / half_width
+        c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
+        at_s = dx * (c / cell_s) + (dy * (s / cell_s) - first[0] / CELL)
+        at_p = dy * (c / cell_p) - (dx * (s / cell_p) + first[1] / CELL)
+        within = (np.abs(at_s - (n_s - 1) / 2) < (n_s - 1) / 2) & (np.abs(at_p - (n_p - 1) / 2) < (n_p - 1) / 2)
+        index = np.flatnonzero(within)
+        key = half_width, length, round(shape.taper, 3), *film
+        return _Seen(key, first, cell_s, cell_p, index // len(dx), at_s.ravel()[index], at_p.ravel()[index], index, within.shape)
+
+    def values(self, shape: NeedleShape, slants: Float | None, *, slopes: bool) -> tuple[Float, list[Float]]:
+        """Return the opacity and what else the tables hold."""
+        last = None if slopes else -2
+        if slants is None:
+            value, *more = _look_up(_table(*self.key, 0.0, "")[:last], self.at_s, self.at_p)
+        else:
+            off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
+            tables = [_table(*self.key, q, "ends")[:last] for q in np.round(slants[0] - off_q, 4).tolist()]
+            parts = [slice(*ends) for ends in pairwise(np.searchsorted(self.arm, np.arange(len(tables) + 1)))]
+            found = [_look_up(table, self.at_s[i], self.at_p[i]) for table, i in zip(tables, parts, strict=True)]
+            value, *more = np.concatenate(found, axis=1)
+            value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
+        value += (shape.half_width_px - self.key[0]) * more[0] + (shape.length_px - self.key[1]) * more[1]
+        return value, more
+
+    def spread(self, rows: Sequence[Float] | Float) -> Float:
+        """Put rows of what is seen to arms and pixels, zero elsewhere."""
+        out = np.zeros((len(rows), self.shape[0] * self.shape[1]))
+        for into, row in zip(out, rows, strict=True):
+            into[self.index] = row
+        return out.reshape(len(rows), *self.shape)
 
 
 def support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:
