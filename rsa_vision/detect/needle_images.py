@@ -283,9 +283,10 @@ class _Seen:
 
 def support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:
     """Pixels (rows, columns) within ``margin`` of an arm's axis rectangle, by the offsets of columns and rows from the tip."""
-    inside: Bool = dx**2 + (dy**2)[:, None] < margin**2
+    dx, dy = dx.astype(np.float32), dy.astype(np.float32)[:, None]
+    inside: Bool = dx**2 + dy**2 < margin**2
     middle = shape.length_px / 2
-    for c, s in zip(np.cos(angles), -np.sin(angles), strict=True):
-        along, across = (dx * c - middle) + (dy * s)[:, None], (dy * c)[:, None] - dx * s
+    for c, s in zip(np.cos(angles).tolist(), (-np.sin(angles)).tolist(), strict=True):
+        along, across = (dx * c - middle) + dy * s, dy * c - dx * s
         inside |= (np.abs(along) < middle + margin) & (np.abs(across) < shape.half_width_px + margin)
     return inside

@@ -143,7 +143,7 @@ def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Op
     for col, row, angle, ring, _ in junctions:
         start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
         angles = angle + np.array([0.0, np.pi / 2, -np.pi / 2])
-        fit = fit_needles(film, np.array([col, row]), angles, start, optics, noise, rigid=True)
+        fit = fit_needles(film, np.array([col, row]), angles, start, optics, noise)
         if is_tee(fit, slack=ROUGH):
             rough.append(fit)
         if sum(is_tee(f) for f in rough) >= ENOUGH:
