@@ -22,6 +22,8 @@ from rsa_vision.types import Bool, Float
 
 LIKENESS = 0.4  # correlation coefficient from which a place is worth a fit; two tees one over the other reach 0.5 to 0.7
 SCALE = 2  # the film is searched at half resolution
+_BAND = 128  # rows of that, which stay in the cache
+_APART = 2  # pixels of that, between peaks
 _SPARSE = 16  # every so-manieth pixel tells the mean of a film
 _LEAST_VARIANCE = 0.02  # of rounded values, means of four
 
@@ -48,17 +50,21 @@ def find_like(film: NDArray[Any], template: NDArray[np.float32]) -> Float:
     ndarray of shape (n, 3)
         col_px, row_px, correlation coefficient; best first.
     """
-    small = cv2.resize(film, (film.shape[1] // SCALE, film.shape[0] // SCALE), interpolation=cv2.INTER_AREA).astype(np.float32)
+    n_rows, n_cols = (n // SCALE for n in film.shape)
     side = len(template)
-    if min(small.shape) <= side:
-        return np.zeros((0, 3))
-    likeness = _correlation(small, template)
-    row, col = np.divmod(np.flatnonzero(likeness > LIKENESS), likeness.shape[1])
-    peak = likeness[row, col] == cv2.dilate(likeness, np.ones((5, 5), np.uint8))[row, col]
-    row, col = row[peak], col[peak]
-    centre = side // 2
-    table = np.stack([(col + centre + 0.5) * SCALE - 0.5, (row + centre + 0.5) * SCALE - 0.5, likeness[row, col]], axis=1)
-    return table[np.argsort(-table[:, 2])].astype(np.float64)
+    found = [np.zeros((0, 3))]
+    for first in range(0, n_rows - side + 1 if min(n_rows, n_cols) > side else 0, _BAND):
+        top, bottom = max(first - _APART, 0), min(first + _BAND + _APART + side - 1, n_rows)
+        band = film[SCALE * top : SCALE * bottom, : SCALE * n_cols]
+        likeness = _correlation(cv2.resize(band, (n_cols, bottom - top), interpolation=cv2.INTER_AREA).astype(np.float32), template)
+        row, col = np.divmod(np.flatnonzero(likeness > LIKENESS), likeness.shape[1])
+        around = cv2.dilate(likeness, np.ones((2 * _APART + 1,) * 2, np.uint8))
+        peak = (likeness[row, col] == around[row, col]) & (row >= first - top) & (row < first - top + _BAND)
+        row, col = row[peak], col[peak]
+        centre = side // 2 + 0.5
+        found.append(np.stack([(col + centre) * SCALE - 0.5, (row + top + centre) * SCALE - 0.5, likeness[row, col]], axis=1))
+    table = np.concatenate(found)
+    return table[np.argsort(-table[:, 2])]
 
 
 def _correlation(image: NDArray[np.float32], template: NDArray[np.float32]) -> NDArray[np.float32]:
