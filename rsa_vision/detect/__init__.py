@@ -34,7 +34,7 @@ from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.painted import paint
-from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, on_tees, optics_of_pins, split_strokes
+from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import doubt_of_number, images_beside, resolve_balls
 from rsa_vision.detect.rims import goes_on
@@ -104,9 +104,7 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     limit = significance_limit(values.size, 2.5, false_detections)
     faint = find_candidates(values, STRENGTH, noise)
     candidates = faint.rows(np.abs(faint.strength) > STRENGTH)
-    strokes, arms = split_strokes(candidates.strokes, candidates.junctions)
-    pins = look_for_pins(values, strokes, noise)
-    candidates = replace(candidates, strokes=arms)
+    pins = look_for_pins(values, candidates.strokes, noise)
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
         _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, noise, limit)
@@ -182,11 +180,9 @@ def _one_polarity(
     tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]
-    arms = candidates.strokes[np.sign(candidates.strokes[:, 5]) == -sign]
-    rough_pins = rough_pins + look_for_pins(film, arms[~on_tees(arms[:, :2], tees)], noise)
     pins, pin_optics = find_pins(film, [p for p in rough_pins if np.sign(p.depth) == sign], tees, optics, noise)
 
-    needles = paint(film.shape, [(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
+    needles = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
 
     balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needles)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)

@@ -51,11 +51,9 @@ def clusters(needles: list[NeedleFit]) -> list[list[NeedleFit]]:
 def others_beside(members: NeedleFit | list[NeedleFit], rest: list[NeedleFit], optics: Optics) -> Images | None:
     """Return the images of those beside the members, for the fits to subtract; None where there are none."""
     mine = members if isinstance(members, list) else [members]
-    near = []
-    for t in rest:
-        gaps = [np.hypot(*(t.position_px - m.position_px)) - 1.3 * (t.shape.length_px + m.shape.length_px) for m in mine]
-        if min(gaps) < 10:
-            near.append(t)
+    place, length = np.array([t.position_px for t in rest]).reshape(-1, 2), np.array([t.shape.length_px for t in rest])
+    gaps = np.min([np.hypot(*(place - m.position_px).T) - 1.3 * (length + m.shape.length_px) for m in mine], axis=0)
+    near = [rest[i] for i in np.flatnonzero(gaps < 10)]
     if not near:
         return None
 

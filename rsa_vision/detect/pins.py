@@ -24,7 +24,6 @@ EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters le
 BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 _MOST_STROKES = 60
 _MOST_IN_VAIN = 20  # strokes in a row that are no pins
-_MOST_ARMS = 15  # strokes at junctions that are looked at before tees are known: they tell the polarity
 _ROUGH, _STANDS_OUT_ROUGHLY = 0.85, 11.0  # explained by a first look, with guessed optics; its significance
 _SIGNIFICANT = 9.0
 _SURER_THAN_ROD = 12.0  # half the chi2 by which a rod must be worse
@@ -81,34 +80,6 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
     return _distinct(found)
 
 
-def split_strokes(strokes: Float, junctions: Float) -> tuple[Float, Float]:
-    """Put aside strokes that begin at junctions but for the strongest: arms of tees, most likely, which need no fits of pins.
-
-    Parameters
-    ----------
-    strokes : ndarray of shape (n, 6)
-        As of :func:`rsa_vision.detect.strokes.find_strokes`.
-    junctions : ndarray of shape (k, 5)
-        As of :func:`rsa_vision.detect.junctions.find_junctions`.
-
-    Returns
-    -------
-    now, later : ndarray of shape (m, 6), (n - m, 6)
-    """
-    dx, dy = (strokes[:, None, :2] - junctions[:, :2]).transpose(2, 0, 1) / strokes[:, 3, None]
-    c, s = np.cos(strokes[:, 2, None]), -np.sin(strokes[:, 2, None])
-    along, across = dx * c + dy * s, np.abs(dy * c - dx * s)
-    arm = ((along > 0.5) & (along < 2) & (across < 0.5)).any(axis=1)
-    ranked = np.argsort(-np.abs(strokes[:, 5]))
-    later = ranked[arm[ranked]][_MOST_ARMS:]
-    return np.delete(strokes, later, axis=0), strokes[later]
-
-
-def on_tees(places: Float, tees: list[NeedleFit]) -> Bool:
-    """Say which places (n, 2) lie on arms of tees, shape (n,)."""
-    return np.asarray(np.any([np.zeros(len(places), bool), *(_on_arm(places, tee) for tee in tees)], axis=0))
-
-
 def find_pins(
     film: NDArray[Any], rough: list[NeedleFit], tees: list[NeedleFit], optics: Optics, noise: NoiseModel
 ) -> tuple[list[NeedleFit], Optics]:
@@ -131,7 +102,8 @@ def find_pins(
         With the attenuation that suits the pins.
     """
     middle = np.array([_middle(f) for f in rough]).reshape(-1, 2)
-    rough = [f for f, on in zip(rough, on_tees(middle, tees), strict=True) if not on]
+    on_tees = np.any([np.zeros(len(rough), bool), *(_on_arm(middle, tee) for tee in tees)], axis=0)
+    rough = [f for f, on in zip(rough, on_tees, strict=True) if not on]
     if not rough:
         return [], optics
     taper, sample = _best_taper(film, rough[:_SAMPLE], optics, noise)

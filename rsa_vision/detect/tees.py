@@ -175,12 +175,13 @@ def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: No
 def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Find faint tees whose arms reach among those of brighter ones: what the film looks like without these."""
     starts: list[tuple[float, NeedleFit]] = []
-    painted, seen = paint(film.shape, [(t, optics) for t in tees]), template_of(model, optics)
+    painted, seen = paint([(t, optics) for t in tees]), template_of(model, optics)
     for tee in tees:
         half = int(2.5 * tee.shape.length_px)
         left, top = (max(int(x) - half, 0) // SCALE * SCALE for x in tee.position_px)
-        box = slice(top, top + 2 * half), slice(left, left + 2 * half)
-        for col, row, likeness in find_like(film[box] - painted.canvas[box], seen):
+        box = film[top : top + 2 * half, left : left + 2 * half]
+        rows, cols = np.mgrid[top : top + box.shape[0], left : left + box.shape[1]]
+        for col, row, likeness in find_like(box - painted(cols, rows), seen):
             place = np.array([col + left, row + top])
             if min(np.hypot(*(t.position_px - place)) for t in tees) > _NEAREST_PX:
                 starts.append((likeness, replace(model, position_px=place)))
