@@ -16,19 +16,19 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
-_MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
+MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
 
 
-def fit_all(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, again: bool = False) -> list[NeedleFit]:
+def fit_all(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, again: int = 0) -> list[NeedleFit]:
     """Fit every set whose arms cross in one go, with the images of the others subtracted.
 
-    ``again``: they were fitted in the same way before, so that what has come to rest and has no neighbours stays as it is.
+    ``again``: sets of up to so many were fitted in the same way before, so that what has come to rest and has no neighbours stays as it is.
     """
     out: list[NeedleFit] = []
     for members in clusters(needles):
         rest = [t for t in needles if all(t is not m for m in members)]
         others = others_beside(members, rest, optics)
-        at_rest = again and others is None and all(m.converged for m in members)
+        at_rest = len(members) <= again and others is None and all(m.converged for m in members)
         out += members if at_rest else fit_crossing(film, members, optics, noise, others=others)
     return out
 
@@ -43,7 +43,7 @@ def clusters(needles: list[NeedleFit]) -> list[list[NeedleFit]]:
     reach = (length[:, None] + length[None]) * 1.02
     while True:  # arms that only just touch can do with subtraction, if joining them all would make too large a fit
         n, label = connected_components(csr_array(gap < reach), directed=False)
-        if n == len(needles) or np.bincount(label).max() <= _MOST_TOGETHER:
+        if n == len(needles) or np.bincount(label).max() <= MOST_TOGETHER:
             return [[needles[i] for i in np.nonzero(label == k)[0]] for k in range(n)]
         reach = reach * 0.85
 

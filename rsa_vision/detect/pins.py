@@ -12,7 +12,7 @@ from rsa_vision.detect.crossing import chi2_of, window_of
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
-from rsa_vision.detect.needle_sets import TAPERS, fit_all
+from rsa_vision.detect.needle_sets import MOST_TOGETHER, TAPERS, fit_all
 from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
@@ -120,7 +120,7 @@ def find_pins(
         for f, shapes in zip(rough, starts, strict=True)
     ]
     pins = _pointed(film, _distinct([f for f in pins if is_pin(f)]), optics, noise)
-    pins = [f for f in fit_all(film, pins, optics, noise, again=True) if is_pin(f)]
+    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
     return [_less_sure_along(f, np.hypot(along_px, _POINT * f.shape.half_width_px)) for f in pins if is_pin(f)], optics
 

@@ -14,7 +14,7 @@ from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MIS
 from rsa_vision.detect.junctions import RINGS_PX
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
-from rsa_vision.detect.needle_sets import TAPERS, fit_all, others_beside
+from rsa_vision.detect.needle_sets import MOST_TOGETHER, TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import paint
@@ -60,10 +60,10 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     if not models:
         return [], [], optics
     tees = _like(film, models, optics, noise)
-    for _ in range(2):  # beside neighbours that were fitted, too
-        tees = _distinct(fit_all(film, tees, optics, noise, again=True), models[0])
+    for again in (1, MOST_TOGETHER):
+        tees = _distinct(fit_all(film, tees, optics, noise, again=again), models[0])
     if under := _outshone(film, tees, models[0], optics, noise):
-        tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=True), models[0])
+        tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=MOST_TOGETHER), models[0])
     if not tees:
         return [], [], optics
     around = tees
