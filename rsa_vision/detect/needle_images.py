@@ -25,7 +25,7 @@ CELL = 0.3  # pixels between the nodes of a needle table
 GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
-_PAD = 4.0  # blur widths beyond the outline where nothing is left that noise would let be seen
+_PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, opti
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Pixels at which an arm is seen: most see one at the most, and beyond its table an arm is nothing.
+    """Pixels at which an arm is seen: most see one at the most.
 
     Tables stand on a grid of shapes, shared by all needles of a film, and are stretched; what else a size changes is linear in between.
     """
@@ -253,7 +253,8 @@ class _Seen:
         c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
         at_s = dx * (c / cell_s) + (dy * (s / cell_s) - first[0] / CELL)
         at_p = dy * (c / cell_p) - (dx * (s / cell_p) + first[1] / CELL)
-        within = (np.abs(at_s - (n_s - 1) / 2) < (n_s - 1) / 2) & (np.abs(at_p - (n_p - 1) / 2) < (n_p - 1) / 2)
+        middle_s, middle_p, rim = (n_s - 1) / 2, (n_p - 1) / 2, (_PAD - _FADED) * film[0] / CELL
+        within = (np.abs(at_s - middle_s) < middle_s - rim) & (np.abs(at_p - middle_p) < middle_p - rim)
         index = np.flatnonzero(within)
         key = half_width, length, round(shape.taper, 3), *film
         return _Seen(key, first, cell_s, cell_p, index // len(dx), at_s.ravel()[index], at_p.ravel()[index], index, within.shape)
