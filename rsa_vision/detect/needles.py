@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from rsa_vision.detect.ball_equations import polynomial
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape, arm_images, support
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.patches import cut, damped_solution, weighted_least_squares
+from rsa_vision.detect.patches import cut, damped_solution
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 _STEPS = 14
-_CONVERGED_PX = 5e-4
+_CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
 _CLOSE_PX = 0.1
 PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
 STANDS_OUT = 15.0  # significance from which noise may hide the form: what is chosen of a film's places stands out less
@@ -176,8 +176,10 @@ def under(image: Float) -> Bool:
 
 def significance_of(image: Float, surface: Float, weight: Float) -> float:
     """Return how many standard deviations an image (n,) stands out of any background (p, n), its shape being given."""
-    part = weighted_least_squares(surface.T, weight, image)
-    return float(np.sqrt(weight @ (image - part @ surface) ** 2))
+    rows = np.concatenate([surface, image[None]]) * np.sqrt(weight)
+    gram = rows @ rows.T
+    alike = gram[:-1, -1] @ damped_solution(gram[:-1, :-1], gram[:-1, -1], 1e-9)
+    return float(np.sqrt(max(gram[-1, -1] - alike, 0.0)))
 
 
 def explains(fit: NeedleFit, least: float, stands_out: float = STANDS_OUT) -> bool:

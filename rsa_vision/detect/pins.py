@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -265,18 +266,19 @@ def _left(fit: NeedleFit) -> float:
 def _distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
     for fit in sorted(pins, key=_left):
-        if all(np.hypot(*(fit.position_px - k.position_px)) > _NEAREST_PX and not _same_body(fit, k) for k in kept):
+        if all(math.dist(fit.position_px, k.position_px) > _NEAREST_PX and not _same_body(fit, k) for k in kept):
             kept.append(fit)
     return kept
 
 
 def _same_body(a: NeedleFit, b: NeedleFit) -> bool:
     """Say whether two fits lie on the same stroke, perhaps the other way round."""
-    return bool(np.hypot(*(_middle(a) - _middle(b))) < 0.25 * a.shape.length_px)
+    return math.dist(_middle(a), _middle(b)) < 0.25 * a.shape.length_px
 
 
 def _middle(fit: NeedleFit) -> Float:
-    middle: Float = fit.position_px + 0.5 * fit.shape.length_px * np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
+    half, angle = 0.5 * fit.shape.length_px, float(fit.angles[0])
+    middle: Float = fit.position_px + half * np.array([math.cos(angle), -math.sin(angle)])
     return middle
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -183,7 +184,7 @@ def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optic
         rows, cols = np.mgrid[top : top + box.shape[0], left : left + box.shape[1]]
         for col, row, likeness in find_like(box - painted(cols, rows), seen):
             place = np.array([col + left, row + top])
-            if min(np.hypot(*(t.position_px - place)) for t in tees) > _NEAREST_PX:
+            if min(math.dist(t.position_px, place) for t in tees) > _NEAREST_PX:
                 starts.append((likeness, replace(model, position_px=place)))
     best = [start for _, start in sorted(starts, key=lambda item: -item[0])]
     return _peeled(film, best, optics, noise, tees)[len(tees) :]
@@ -202,8 +203,8 @@ def _peeled(
         others = others_beside(start, kept, optics)
         fit = fit_crossing(film, [start], optics, noise, others=others, quick=True)[0]
         deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > _FAINTEST * abs(start.depth)
-        near = np.hypot(*(fit.position_px - start.position_px)) < 2 * _NEAREST_PX
-        if deep and near and is_tee(fit, slack=ROUGH) and all(np.hypot(*(k.position_px - fit.position_px)) > _NEAREST_PX for k in kept):
+        near = math.dist(fit.position_px, start.position_px) < 2 * _NEAREST_PX
+        if deep and near and is_tee(fit, slack=ROUGH) and all(math.dist(k.position_px, fit.position_px) > _NEAREST_PX for k in kept):
             kept.append(fit)
             in_vain = 0
     return kept
@@ -213,6 +214,6 @@ def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
     for fit in sorted(tees, key=lambda f: f.misfit + 1 - f.explained):
         deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > _FAINTEST * abs(model.depth)
-        if deep and is_tee(fit, slack=ROUGH) and all(np.hypot(*(fit.position_px - k.position_px)) > _NEAREST_PX for k in kept):
+        if deep and is_tee(fit, slack=ROUGH) and all(math.dist(fit.position_px, k.position_px) > _NEAREST_PX for k in kept):
             kept.append(fit)
     return kept
