@@ -36,7 +36,7 @@ def look_clear(fits: BallFits, noise: NoiseModel) -> Bool:
 
 
 def hopeless(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:
-    """Say which first fits are not worth better ones: far fainter than the film's sure balls, or fainter, not like a ball, and not of their sizes.
+    """Say which first fits are not worth better ones: far fainter than the film's sure balls, or fainter, unlike balls and of other sizes.
 
     Parameters
     ----------

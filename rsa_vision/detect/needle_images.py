@@ -141,7 +141,9 @@ def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, 
 
 
 @lru_cache(maxsize=256)
-def _table(half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float, more: str) -> NDArray[np.float32]:
+def _table(
+    half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float, more: str
+) -> NDArray[np.float32]:
     """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
     ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur and by
@@ -246,7 +248,8 @@ class _Seen:
 
     @staticmethod
     def of(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> _Seen:
-        half_width, length = (round(GRID ** math.floor(math.log(size) / math.log(GRID)), 4) for size in (shape.half_width_px, shape.length_px))
+        sizes = shape.half_width_px, shape.length_px
+        half_width, length = (round(GRID ** math.floor(math.log(size) / math.log(GRID)), 4) for size in sizes)
         film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
         first, (n_s, n_p) = _grid(half_width, length, film[0])
         cell_s, cell_p = CELL * shape.length_px / length, CELL * shape.half_width_px / half_width
@@ -284,10 +287,10 @@ class _Seen:
 
 def support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:
     """Pixels (rows, columns) within ``margin`` of an arm's axis rectangle, by the offsets of columns and rows from the tip."""
-    dx, dy = dx.astype(np.float32), dy.astype(np.float32)[:, None]
-    inside: Bool = dx**2 + dy**2 < margin**2
+    x, y = dx.astype(np.float32), dy.astype(np.float32)[:, None]
+    inside: Bool = x**2 + y**2 < margin**2
     middle = shape.length_px / 2
     for c, s in zip(np.cos(angles).tolist(), (-np.sin(angles)).tolist(), strict=True):
-        along, across = (dx * c - middle) + dy * s, dy * c - dx * s
+        along, across = (x * c - middle) + y * s, y * c - x * s
         inside |= (np.abs(along) < middle + margin) & (np.abs(across) < shape.half_width_px + margin)
     return inside

@@ -73,10 +73,8 @@ def _correlation(image: NDArray[np.float32], template: NDArray[np.float32]) -> N
     image = image - image[::_SPARSE, ::_SPARSE].mean()
     product = cv2.matchTemplate(image, bare, cv2.TM_CCORR)
     inside = slice(side // 2, -(side // 2))
-    mean, variance = (moment(image, cv2.CV_64F, (side, side)) for moment in (cv2.boxFilter, cv2.sqrBoxFilter))
-    mean *= mean
-    variance -= mean
-    spread = cv2.sqrt(cv2.max(variance[inside, inside].astype(np.float32), _LEAST_VARIANCE))
+    mean, square = (np.asarray(m(image, cv2.CV_64F, (side, side))[inside, inside], np.float64) for m in (cv2.boxFilter, cv2.sqrBoxFilter))
+    spread = np.sqrt(np.maximum((square - mean * mean).astype(np.float32), np.float32(_LEAST_VARIANCE)))
     return np.asarray(cv2.divide(product, spread, dst=product, scale=1 / (side * float(np.linalg.norm(bare)))))
 
 
@@ -97,7 +95,7 @@ def promising(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optic
     ndarray of bool, shape (n,)
     """
     half = int(known.shape.length_px + 3 * optics.sigma_px) + 1
-    axis = np.arange(-half, half + 1)
+    axis = np.arange(-half, half + 1.0)
     row, col = np.nonzero(support(axis - 0.5, axis - 0.5, known.angles, known.shape, 3 * optics.sigma_px)) - np.array(half)
     image = needle_image(col - 0.5, row - 0.5, known, optics)
     cols, rows = ((np.floor(at)[:, None] + step).astype(np.intp) for at, step in zip(places.T, (col, row), strict=False))
