@@ -182,7 +182,7 @@ def _one_polarity(
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]
     pins, pin_optics = find_pins(film, [p for p in rough_pins if np.sign(p.depth) == sign], tees, optics, noise)
 
-    needles = paint(film.shape, [(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
+    needles = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
 
     balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needles)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)

@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import polynomial
 from rsa_vision.detect.needle_images import Images, NeedleFit, NeedleShape, arm_images, needle_image, support
-from rsa_vision.detect.needles import between, explains, scored
+from rsa_vision.detect.needles import PROMISING, between, explains, scored, step_of
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
-_STEPS, _QUICK_STEPS = 16, 3
-_CONVERGED_PX = 4e-3  # a step's change: what is left after it is far less
-_PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
-_AROUND_PX, _AROUND_QUICK_PX = 4.0, 1.0  # beyond three blurs from the arms, which tell the background
+_STEPS, _QUICK_STEPS = 16, 5
+_CONVERGED_PX = 0.02  # a step's change: what is left after it is a tenth of that, and the last fit follows
+_AROUND_PX = 4.0  # beyond three blurs from the arms, which tell the background
 _LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
 _GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
 
@@ -63,7 +62,6 @@ def window_of(
     optics: Optics,
     noise: NoiseModel,
     others: Images | None,
-    around_px: float = _AROUND_PX,
 ) -> Window:
     """Cut out the pixels around the arms of some needles, the images of others taken away."""
     middle = np.mean([f.position_px for f in needles], axis=0)
@@ -75,7 +73,7 @@ def window_of(
     near = np.zeros((patch.size, patch.size), bool)
     for f in needles:
         dx, dy = (axis + (first - at) for first, at in zip(corner, f.position_px, strict=True))
-        near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + around_px)
+        near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + _AROUND_PX)
     rows, cols = np.nonzero(near & patch.valid[0])
     raw = patch.values[0][rows, cols]
     cols, rows = cols + corner[0], rows + corner[1]
@@ -116,7 +114,7 @@ def fit_crossing(
     steps : int
         At the most.
     quick : bool
-        For a first look: few steps, fewer pixels around, and no step at all from starts that explain little of what lies under them.
+        For a first look: few steps, and no step at all from starts that explain little of what neighbours leave.
 
     Returns
     -------
@@ -124,7 +122,7 @@ def fit_crossing(
         In the order of the starts, with the covariances of these; figures of merit are taken under each needle's own arms.
     """
     now = list(needles)
-    window = window_of(film, now, optics, noise, others, _AROUND_QUICK_PX if quick else _AROUND_PX)
+    window = window_of(film, now, optics, noise, others)
     steps = min(steps, _QUICK_STEPS) if quick else steps
     cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.size // 2
     weight = 1.0 / noise.variance_at(data + window.beside)
@@ -152,12 +150,9 @@ def fit_crossing(
         now = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta[: len(now)], strict=True)]
         if step == steps or converged:
             break
-        if step == 0 and quick and not any(explains(f, _PROMISING, 0.0) for f in told()):
+        if step == 0 and quick and others is not None and not any(explains(f, PROMISING, 0.0) for f in told()):
             break
-        unit = np.append(np.repeat(theta[: len(now)], tees.shape[1] - 1), np.ones(len(linear)))  # derivatives above are of depth one
-        right = unit * (gram[:-1, -1] - gram[:-1, at] @ theta)
-        delta = damped_solution(gram[:-1, :-1] * np.outer(unit, unit), right, 1e-3 if step < 4 else 1e-6)
-        delta = delta[: len(moves)].reshape(len(now), -1)
+        delta = step_of(gram, theta, tees.shape[1] - 1, 1e-3 if step < 4 else 1e-6).reshape(len(now), -1)
         if step in (2, 6):
             weight = 1.0 / noise.variance_at(theta @ linear + window.beside)
         scale = min(1.0, 1.0 / max(float(np.abs(delta[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(delta[:, -1]).max()), 1e-9))

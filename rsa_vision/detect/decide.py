@@ -13,6 +13,7 @@ SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom 
 ALONE = 10.0  # the same for marks of which there are not enough to tell what they are like
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
+_LOST = 0.75  # of that, below which a first fit is too low for a mark
 UNEXCUSED = 0.5  # those below that have to fit closely
 EDGE = 16.0  # more variance than this around a ball, in units of the noise, is an edge beside it; edges do not look like balls
 SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
@@ -35,7 +36,7 @@ def look_clear(fits: BallFits, noise: NoiseModel) -> Bool:
 
 
 def hopeless(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:
-    """Say which first fits are not worth better ones: fainter than the film's sure balls, not like a ball, and far from their sizes.
+    """Say which first fits are not worth better ones: far fainter than the film's sure balls, or fainter, unlike balls and of other sizes.
 
     Parameters
     ----------
@@ -57,7 +58,9 @@ def hopeless(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:
     faint = (height < UNEXCUSED * np.median(height[pattern])) & (fits.explained < EXPLAINED)
     high = min(_FAR * _LARGER * radii.max(), RADIUS_PX[1])
     unlike = (fits.radius_px < _SMALLER / _FAR * radii.min()) | (fits.radius_px >= high) | (misfit(fits, noise) > 2 * MISFIT)
-    return np.asarray(faint & unlike)
+    over_noise = height / np.sqrt(noise.variance_at(fits.background))
+    lost = np.logical_and(*(h < _LOST * FAINT * np.median(h[pattern]) for h in (height, over_noise)))
+    return np.asarray((faint & unlike) | lost)
 
 
 def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:

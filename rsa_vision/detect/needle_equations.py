@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from rsa_vision.detect.crossing import Window, gain_at, lapping
-from rsa_vision.detect.needle_images import NeedleFit, arm_images
+from rsa_vision.detect.needle_images import NeedleFit, arm_images, arms_by_optics
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import damped_solution
 from rsa_vision.detect.profiles import Optics
@@ -204,6 +204,6 @@ def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
 
 
 def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
-    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n); how the ends slant hardly matters."""
+    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n)."""
     offsets = [(window.cols - f.position_px[0], window.rows - f.position_px[1]) for f in members]
-    return [arm_images(*at, f.angles, f.shape, optics, by_optics=True)[-OPTICS:] for at, f in zip(offsets, members, strict=True)]
+    return [arms_by_optics(*at, f.angles, f.shape, optics) for at, f in zip(offsets, members, strict=True)]

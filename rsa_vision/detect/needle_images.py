@@ -6,16 +6,18 @@ Here the tip is a parameter of the image.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
 Images = Callable[[Float, Float], Float]
 """Images of some marks at pixels (cols, rows), in film values over the background."""
@@ -23,7 +25,7 @@ CELL = 0.3  # pixels between the nodes of a needle table
 GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
-_PAD = 5.0  # blur widths around the needle that a table covers
+_PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,55 +136,56 @@ def _opacity(
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
     """Return where the grid of a table begins along and across the needle, and how many nodes it has."""
     pad = _PAD * sigma
-    half = int(np.ceil((half_width + pad) / CELL))
-    return (-pad, -half * CELL), (int(np.ceil((length + 2 * pad) / CELL)) + 1, 2 * half + 1)
+    half = math.ceil((half_width + pad) / CELL)
+    return (-pad, -half * CELL), (math.ceil((length + 2 * pad) / CELL) + 1, 2 * half + 1)
 
 
 @lru_cache(maxsize=256)
 def _table(
     half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float, more: str
 ) -> NDArray[np.float32]:
-    """Opacity, its slopes along and across, its derivatives by half width and length as the grid stretches with them, and more: first axis.
+    """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
-    ``more``: "ends" for derivatives by slant and skew, "optics" for those by the logarithms of attenuation and blur and by the taper.
+    ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur and by
+    the taper, alone.
     """
     one = half_width, length, taper, sigma, mu, bend, slant
     base = _opacity(*one)
-    nodes = [(_opacity(*one, wider=GRID) - base) / ((GRID - 1) * half_width), (_opacity(*one, longer=GRID) - base) / ((GRID - 1) * length)]
+    nodes = [
+        base,
+        (_opacity(*one, wider=GRID) - base) / ((GRID - 1) * half_width),
+        (_opacity(*one, longer=GRID) - base) / ((GRID - 1) * length),
+    ]
     if more == "ends":
         nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
+    nodes += np.gradient(base, CELL)
     if more == "optics":
         factor = float(np.exp(STEP))
         dense, wide = _opacity(*one[:4], mu * factor, bend, slant), _opacity(*one, blurrier=factor)
         short = _opacity(half_width, length, taper - STEP, *one[3:])
-        nodes += [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
-    table = np.array([base, *np.gradient(base, CELL), *nodes], np.float32)
+        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
+    table = np.array(nodes, np.float32)
     table[:, [0, -1]] = table[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return table
 
 
-def _look_up(table: NDArray[np.float32], first: tuple[float, float], s: Float, p: Float) -> NDArray[np.float32]:
-    """Interpolate all columns of a table bilinearly; 0 beyond it. Single precision is far finer than the tables."""
-    _, n_s, n_p = table.shape
-    at_s, at_p = ((x - start).astype(np.float32) * np.float32(1 / CELL) for x, start in zip((s, p), first, strict=True))
-    for at, last in ((at_s, n_s - 1.01), (at_p, n_p - 1.01)):
-        np.maximum(at, 0.0, out=at)
-        np.minimum(at, np.float32(last), out=at)
-    low_s, low_p = at_s.astype(np.int32), at_p.astype(np.int32)
-    at_s -= low_s
-    at_p -= low_p
-    node = (low_s * n_p + low_p).astype(np.intp)
+def _look_up(table: NDArray[np.float32], at_s: Float, at_p: Float) -> Float:
+    """Interpolate all columns of a table bilinearly at these places in units of its cells, within it; single precision is far finer."""
+    n_p = table.shape[2]
+    low_s, low_p = at_s.astype(np.intp), at_p.astype(np.intp)
+    part_s, part_p = (at_s - low_s).astype(np.float32), (at_p - low_p).astype(np.float32)
+    node = low_s * n_p + low_p
     nodes = table.reshape(len(table), -1)
     near: NDArray[np.float32] = nodes.take(node, axis=1)
     beside, far, across = (nodes.take(node + step, axis=1) for step in (1, n_p, n_p + 1))
     for low, high in ((near, beside), (far, across)):
         high -= low
-        high *= at_p
+        high *= part_p
         low += high
     far -= near
-    far *= at_s
+    far *= part_s
     near += far
-    return near
+    return near.astype(np.float64)
 
 
 def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
@@ -199,48 +202,95 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
     -------
     ndarray of the shape of ``dx``
     """
-    values = arm_images(dx.ravel(), dy.ravel(), fit.angles, fit.shape, optics, fit.slants)[0]
-    image: Float = (fit.depths @ values).reshape(dx.shape)
+    seen = _Seen.of(dx.ravel(), dy.ravel(), fit.angles, fit.shape, optics)
+    values, _ = seen.values(fit.shape, fit.slants, slopes=False)
+    image: Float = (fit.depths @ seen.spread([values])[0]).reshape(dx.shape)
     return image
 
 
-def arm_images(
-    dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None, *, by_optics: bool = False
-) -> Float:
+def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None) -> Float:
     """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the second axis.
 
-    With slants, those by the slant and by the skew of each arm follow; instead, if asked for, those by what is common to all: the
-    logarithms of attenuation and blur, and the taper.
+    With slants, those by the slant and by the skew of each arm follow.
     """
-    # tables stand on a grid of shapes, shared by all needles of a film, and are stretched; what else a size changes is linear in between
-    half_width, length = (round(GRID ** np.floor(np.log(size) / np.log(GRID)), 4) for size in (shape.half_width_px, shape.length_px))
-    wider, longer = shape.half_width_px / half_width, shape.length_px / length
-    film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
-    key, first = (half_width, length, round(shape.taper, 3), *film), _grid(half_width, length, film[0])[0]
-    c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
-    along, across = dx * c + dy * s, dy * c - dx * s
-    at = along / longer, across / wider
-    if slants is None:
-        columns = _look_up(_table(*key, 0.0, "optics" if by_optics else ""), first, *at)
-    else:
-        off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
-        steps = np.round(slants[0] - off_q, 4).tolist()
-        columns = np.stack([_look_up(_table(*key, q, "ends"), first, a, b) for q, a, b in zip(steps, *at, strict=True)], axis=1)
-    value, g_s, g_p, more_w, more_l, *more = columns.astype(np.float64)
-    value += (shape.half_width_px - half_width) * more_w + (shape.length_px - length) * more_l
-    if slants is not None:
-        value += off_q[:, None] * more[0] + slants[1][:, None] * more[1]
-    g_s, g_p = g_s / longer, g_p / wider
+    seen = _Seen.of(dx, dy, angles, shape, optics)
+    value, (more_w, more_l, *more, g_s, g_p) = seen.values(shape, slants, slopes=True)
+    along, across = (seen.at_s + seen.first[0] / CELL) * seen.cell_s, (seen.at_p + seen.first[1] / CELL) * seen.cell_p
+    c, s = np.cos(angles)[seen.arm], -np.sin(angles)[seen.arm]
+    g_s, g_p = g_s * (CELL / seen.cell_s), g_p * (CELL / seen.cell_p)
     d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
     by_size = [more_w - g_p * across / shape.half_width_px, more_l - g_s * along / shape.length_px]
-    return np.array([value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more])
+    return seen.spread([value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more])
+
+
+def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> Float:
+    """Derivatives of every arm by the logarithms of attenuation and blur, and by the taper; how the ends slant hardly matters."""
+    seen = _Seen.of(dx, dy, angles, shape, optics)
+    return seen.spread(_look_up(_table(*seen.key, 0.0, "optics"), seen.at_s, seen.at_p))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Pixels at which an arm is seen: most see one at the most.
+
+    Tables stand on a grid of shapes, shared by all needles of a film, and are stretched; what else a size changes is linear in between.
+    """
+
+    key: tuple[float, ...]  # of the table: shape, optics
+    first: tuple[float, float]
+    cell_s: float  # stretched
+    cell_p: float
+    arm: Int
+    at_s: Float
+    at_p: Float
+    index: Int  # of arm and pixel
+    shape: tuple[int, ...]  # arms and pixels
+
+    @staticmethod
+    def of(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> _Seen:
+        sizes = shape.half_width_px, shape.length_px
+        half_width, length = (round(GRID ** math.floor(math.log(size) / math.log(GRID)), 4) for size in sizes)
+        film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
+        first, (n_s, n_p) = _grid(half_width, length, film[0])
+        cell_s, cell_p = CELL * shape.length_px / length, CELL * shape.half_width_px / half_width
+        c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
+        at_s = dx * (c / cell_s) + (dy * (s / cell_s) - first[0] / CELL)
+        at_p = dy * (c / cell_p) - (dx * (s / cell_p) + first[1] / CELL)
+        middle_s, middle_p, rim = (n_s - 1) / 2, (n_p - 1) / 2, (_PAD - _FADED) * film[0] / CELL
+        within = (np.abs(at_s - middle_s) < middle_s - rim) & (np.abs(at_p - middle_p) < middle_p - rim)
+        index = np.flatnonzero(within)
+        key = half_width, length, round(shape.taper, 3), *film
+        return _Seen(key, first, cell_s, cell_p, index // len(dx), at_s.ravel()[index], at_p.ravel()[index], index, within.shape)
+
+    def values(self, shape: NeedleShape, slants: Float | None, *, slopes: bool) -> tuple[Float, list[Float]]:
+        """Return the opacity and what else the tables hold."""
+        last = None if slopes else -2
+        if slants is None:
+            value, *more = _look_up(_table(*self.key, 0.0, "")[:last], self.at_s, self.at_p)
+        else:
+            off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
+            tables = [_table(*self.key, q, "ends")[:last] for q in np.round(slants[0] - off_q, 4).tolist()]
+            parts = [slice(*ends) for ends in pairwise(np.searchsorted(self.arm, np.arange(len(tables) + 1)))]
+            found = [_look_up(table, self.at_s[i], self.at_p[i]) for table, i in zip(tables, parts, strict=True)]
+            value, *more = np.concatenate(found, axis=1)
+            value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
+        value += (shape.half_width_px - self.key[0]) * more[0] + (shape.length_px - self.key[1]) * more[1]
+        return value, more
+
+    def spread(self, rows: Sequence[Float] | Float) -> Float:
+        """Put rows of what is seen to arms and pixels, zero elsewhere."""
+        out = np.zeros((len(rows), self.shape[0] * self.shape[1]))
+        for into, row in zip(out, rows, strict=True):
+            into[self.index] = row
+        return out.reshape(len(rows), *self.shape)
 
 
 def support(dx: Float, dy: Float, angles: Float, shape: NeedleShape, margin: float) -> Bool:
     """Pixels (rows, columns) within ``margin`` of an arm's axis rectangle, by the offsets of columns and rows from the tip."""
-    inside: Bool = dx**2 + (dy**2)[:, None] < margin**2
+    x, y = dx.astype(np.float32), dy.astype(np.float32)[:, None]
+    inside: Bool = x**2 + y**2 < margin**2
     middle = shape.length_px / 2
-    for c, s in zip(np.cos(angles), -np.sin(angles), strict=True):
-        along, across = (dx * c - middle) + (dy * s)[:, None], (dy * c)[:, None] - dx * s
+    for c, s in zip(np.cos(angles).tolist(), (-np.sin(angles)).tolist(), strict=True):
+        along, across = (x * c - middle) + y * s, y * c - x * s
         inside |= (np.abs(along) < middle + margin) & (np.abs(across) < shape.half_width_px + margin)
     return inside

@@ -16,19 +16,19 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
-_MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
+MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
 
 
-def fit_all(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, again: bool = False) -> list[NeedleFit]:
+def fit_all(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, again: int = 0) -> list[NeedleFit]:
     """Fit every set whose arms cross in one go, with the images of the others subtracted.
 
-    ``again``: they were fitted in the same way before, so that what has come to rest and has no neighbours stays as it is.
+    ``again``: sets of up to so many were fitted in the same way before, so that what has come to rest and has no neighbours stays as it is.
     """
     out: list[NeedleFit] = []
     for members in clusters(needles):
         rest = [t for t in needles if all(t is not m for m in members)]
         others = others_beside(members, rest, optics)
-        at_rest = again and others is None and all(m.converged for m in members)
+        at_rest = len(members) <= again and others is None and all(m.converged for m in members)
         out += members if at_rest else fit_crossing(film, members, optics, noise, others=others)
     return out
 
@@ -43,7 +43,7 @@ def clusters(needles: list[NeedleFit]) -> list[list[NeedleFit]]:
     reach = (length[:, None] + length[None]) * 1.02
     while True:  # arms that only just touch can do with subtraction, if joining them all would make too large a fit
         n, label = connected_components(csr_array(gap < reach), directed=False)
-        if n == len(needles) or np.bincount(label).max() <= _MOST_TOGETHER:
+        if n == len(needles) or np.bincount(label).max() <= MOST_TOGETHER:
             return [[needles[i] for i in np.nonzero(label == k)[0]] for k in range(n)]
         reach = reach * 0.85
 
@@ -51,11 +51,9 @@ def clusters(needles: list[NeedleFit]) -> list[list[NeedleFit]]:
 def others_beside(members: NeedleFit | list[NeedleFit], rest: list[NeedleFit], optics: Optics) -> Images | None:
     """Return the images of those beside the members, for the fits to subtract; None where there are none."""
     mine = members if isinstance(members, list) else [members]
-    near = []
-    for t in rest:
-        gaps = [np.hypot(*(t.position_px - m.position_px)) - 1.3 * (t.shape.length_px + m.shape.length_px) for m in mine]
-        if min(gaps) < 10:
-            near.append(t)
+    place, length = np.array([t.position_px for t in rest]).reshape(-1, 2), np.array([t.shape.length_px for t in rest])
+    gaps = np.min([np.hypot(*(place - m.position_px).T) - 1.3 * (length + m.shape.length_px) for m in mine], axis=0)
+    near = [rest[i] for i in np.flatnonzero(gaps < 10)]
     if not near:
         return None
 

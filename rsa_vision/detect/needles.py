@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from rsa_vision.detect.ball_equations import polynomial
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape, arm_images, support
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.patches import cut, weighted_least_squares
+from rsa_vision.detect.patches import cut, damped_solution
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 _STEPS = 14
-_CONVERGED_PX = 5e-4
-_CLOSE_PX = 0.03
+_CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
+_CLOSE_PX = 0.1
+PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
 STANDS_OUT = 15.0  # significance from which noise may hide the form: what is chosen of a film's places stands out less
 
 
@@ -29,10 +30,11 @@ def fit_needles(
     optics: Optics,
     noise: NoiseModel,
     *,
-    rigid: bool = False,
     quick: bool = False,
 ) -> NeedleFit:
-    """Fit one pin (one angle) or tee (three); :func:`rsa_vision.detect.shared.fit_shared` states the covariance of its tip.
+    """Fit one pin (one angle) or tee (three, that turn together and are equally deep).
+
+    :func:`rsa_vision.detect.shared.fit_shared` states the covariance of its tip.
 
     Parameters
     ----------
@@ -45,9 +47,6 @@ def fit_needles(
         Start; its taper is kept.
     optics : Optics
     noise : NoiseModel
-    rigid : bool
-        The arms turn together and are equally deep, for a first look, while neighbours still disturb; else each has its own direction and
-        depth.
     quick : bool
         While others still move: fewer steps, fewer pixels around.
 
@@ -64,51 +63,67 @@ def fit_needles(
     rows, cols = np.nonzero(near & patch.valid[0])
     data = patch.values[0][rows, cols]
     cols, rows = cols + corner[0], rows + corner[1]
-    k = len(angles)
     tip, angles = tip_px.astype(np.float64).copy(), angles.astype(np.float64).copy()
-    if len(data) < 30 + 6 + 2 * k:
+    if len(data) < 30 + 6 + 2 * len(angles):
         return _unfit(tip, angles, shape)
     surface = polynomial(half, cols - tip_px[0], rows - tip_px[1]).T
     weight = np.full(len(data), 1.0 / float(noise.variance_at(np.array([data.mean()]))[0]))
-    n_depth = 1 if rigid else k
     converged = False
-    steps, close = (6, _CLOSE_PX) if quick else (_STEPS, _CONVERGED_PX)
-    depths = np.ones(k)
+    steps, close, far = (6, _CLOSE_PX, 3.0) if quick else (_STEPS, _CONVERGED_PX, 1.5)
     for step in range(steps + 1):
-        value, *by_tip_and_size, d_angle = arm_images(cols - tip[0], rows - tip[1], angles, shape, optics)
-        linear = np.concatenate([value.sum(0, keepdims=True) if n_depth < k else value, surface])
-        theta = weighted_least_squares(linear.T, weight, data)
-        depths = np.broadcast_to(theta[:n_depth], (k,))
-        residual = data - theta @ linear
+        image, *moves = arm_images(cols - tip[0], rows - tip[1], angles, shape, optics).sum(1)
+        linear = np.concatenate([image[None], surface])
+        weighted = np.concatenate([moves, linear, data[None]]) * np.sqrt(weight)
+        gram = weighted @ weighted.T
+        theta = damped_solution(gram[len(moves) : -1, len(moves) : -1], gram[len(moves) : -1, -1], 1e-9)
         if step == steps or converged:
             break
-        turns = depths[:, None] * d_angle
-        moves = np.concatenate([depths @ np.array(by_tip_and_size), turns.sum(0, keepdims=True) if rigid else turns])
-        if step in (1, 4):
+        delta = step_of(gram, theta, len(moves), 1e-4 if step < 4 else 1e-7)
+        if step in (0, 3):
             weight = 1.0 / noise.variance_at(theta @ linear)
-        jac = np.concatenate([moves, linear]).T
-        delta = weighted_least_squares(jac, weight, residual, damping=1e-4 if step < 4 else 1e-7)[: len(moves)]
-        scale = min(1.0, 1.5 / max(np.abs(delta[:2]).max(), 1e-9), 0.15 / max(np.abs(delta[4:]).max(), 1e-9))
+        scale = min(1.0, far / max(np.abs(delta[:2]).max(), 1e-9), 0.15 / max(abs(delta[4]), 1e-9))
         tip += scale * delta[:2]
         width = between(shape.half_width_px + between(scale * delta[2], -0.5, 0.5), 0.6, 0.3 * shape.length_px)
         longer = between(scale * delta[3], -2.0, 2.0)
         shape = NeedleShape(width, between(shape.length_px + longer, 3.0, half / 1.05), shape.taper)
-        angles += scale * delta[4:]
+        angles += scale * delta[4]
         converged = step > 0 and bool(np.abs(delta[:2]).max() < close)
         if np.hypot(*(tip - tip_px)) > 0.6 * half:
             return _unfit(tip, angles, shape)
-    image = depths @ value
-    ring = ~_under(image)
-    background = float(theta[n_depth])
-    free = len(theta) + 4 + (1 if rigid else k)
+    image, residual = theta[0] * image, data - theta @ linear
+    ring = ~under(image)
+    background = float(theta[1])
     fit = replace(
         _unfit(tip, angles, shape),
-        depths=depths.copy(),
-        chi2_ring=float((weight * residual**2)[ring].sum() / max(int(ring.sum()) - free, 1)),
+        depths=np.full(len(angles), theta[0]),
+        chi2_ring=float((weight * residual**2)[ring].sum() / max(int(ring.sum()) - len(gram) + 1, 1)),
         converged=converged,
     )
     variance = float(noise.variance_at(np.array([background]))[0])
     return scored(fit, image, residual, weight, surface, background, variance)
+
+
+def step_of(gram: Float, theta: Float, each: int, damping: float) -> Float:
+    """Return the Gauss-Newton step of what moves needles, from the normal equations of all at depth one.
+
+    Parameters
+    ----------
+    gram : ndarray of shape (m + p + 1, m + p + 1)
+        Products of the images' derivatives (for depths of one), of what enters linearly (depths first), and of the data.
+    theta : ndarray of shape (p,)
+        Solution for what enters linearly.
+    each : int
+        Derivatives of each needle's image.
+    damping : float
+
+    Returns
+    -------
+    ndarray of shape (m,)
+    """
+    moves = len(gram) - 1 - len(theta)
+    unit = np.append(np.repeat(theta[: moves // each], each), np.ones(len(theta)))
+    right = unit * (gram[:-1, -1] - gram[:-1, moves:-1] @ theta)
+    return damped_solution(gram[:-1, :-1] * np.outer(unit, unit), right, damping)[:moves]
 
 
 def between(value: float, low: float, high: float) -> float:
@@ -135,7 +150,7 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
     """
     square = weight * residual**2
     depth = float(fit.depths.mean())
-    core = _under(image)
+    core = under(image)
     n_core = int(core.sum())
     left = float(square[core].sum())
     raised = float((weight * (residual + image) ** 2)[core].sum())
@@ -154,15 +169,17 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
     )
 
 
-def _under(image: Float) -> Bool:
+def under(image: Float) -> Bool:
     """Pixels (n,) under the arms of an image."""
     return np.asarray(np.abs(image) > 0.08 * max(float(np.abs(image).max(initial=0.0)), 1e-9))
 
 
 def significance_of(image: Float, surface: Float, weight: Float) -> float:
     """Return how many standard deviations an image (n,) stands out of any background (p, n), its shape being given."""
-    part = weighted_least_squares(surface.T, weight, image)
-    return float(np.sqrt(weight @ (image - part @ surface) ** 2))
+    rows = np.concatenate([surface, image[None]]) * np.sqrt(weight)
+    gram = rows @ rows.T
+    alike = gram[:-1, -1] @ damped_solution(gram[:-1, :-1], gram[:-1, -1], 1e-9)
+    return float(np.sqrt(max(gram[-1, -1] - alike, 0.0)))
 
 
 def explains(fit: NeedleFit, least: float, stands_out: float = STANDS_OUT) -> bool:

@@ -274,7 +274,8 @@ def influence_covariance(influence: Float, correlation: Float) -> Float:
     """
     # by Parseval's theorem in the frequency domain, where the columns of the half spectrum but the first and the middle one stand for two
     size = next_fast_len(influence.shape[-1] + correlation.shape[0], real=True)
-    spectrum = np.fft.rfft2(influence, s=(size, size)).reshape(*influence.shape[:-2], -1)
+    # to six digits, in half the time of double precision
+    spectrum = np.fft.rfft2(influence.astype(np.float32), s=(size, size)).reshape(*influence.shape[:-2], -1)
     weighted = spectrum * _power(correlation.tobytes(), len(correlation), size)
     return np.asarray(np.matmul(weighted, spectrum.conj().swapaxes(-1, -2)).real, np.float64)
 
@@ -286,4 +287,4 @@ def _power(correlation: bytes, side: int, size: int) -> Float:
     kernel[:side, :side] = np.frombuffer(correlation).reshape(side, side)
     power = np.maximum(np.fft.rfft2(np.roll(kernel, (-(side // 2), -(side // 2)), (0, 1))).real, 0.0) / size**2
     power[:, 1 : (size + 1) // 2] *= 2
-    return np.asarray(power.ravel())
+    return np.asarray(power.ravel(), np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +11,9 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.needle_images import NeedleFit, needle_image, support
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
-_BLURS = 5.0  # beyond which an image has faded
+_BLURS = 4.0  # beyond which an image has faded
 _EXPLAINED = 0.8  # of the contrast of a place, made by needles: the rest is less than the half of an arm that a ball must be
 _SAMPLES = 12
 
@@ -23,43 +24,57 @@ class Painted:
 
     Attributes
     ----------
-    canvas : ndarray of float32, shape of the film
-        Zero, and without memory of its own, where no needle is.
+    corner_px : ndarray of int, shape (n, 2)
+        (col, row) of the first pixel of the square around each needle. A picture of the size of the film would be mostly empty, and
+        costs more time than all the rest.
+    images : ndarray of float32, shape (n, s, s)
     """
 
-    canvas: NDArray[np.float32]
+    corner_px: Int
+    images: NDArray[np.float32]
 
     def __call__(self, cols: Float, rows: Float) -> Float:
-        """Return the images at the pixels nearest to these places; beyond the film those of its rim."""
-        return _at(self.canvas, cols, rows)
+        """Return the images at the pixels nearest to these places."""
+        total = np.zeros(cols.shape)
+        if cols.size == 0:
+            return total
+        side = self.images.shape[1]
+        place = np.rint([cols, rows]).astype(np.intp)
+        low, high = (limit(place.reshape(2, -1), axis=1) for limit in (np.min, np.max))
+        for k in np.flatnonzero(((self.corner_px <= high) & (self.corner_px + side > low)).all(1)):
+            col, row = (at - first for at, first in zip(place, self.corner_px[k], strict=True))
+            inside = (col >= 0) & (col < side) & (row >= 0) & (row < side)
+            total[inside] += self.images[k, row[inside], col[inside]]
+        return total
 
     def explain(self, film: NDArray[Any], position_px: Float, radius_px: Float) -> Bool:
         """Say at which places (n, 2) the needles make nearly all by which a disc differs from a ring around it, shape (n,)."""
         angle = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
 
-        def contrast(image: NDArray[Any]) -> Float:
-            on, around = (
-                _at(image, *(position_px.T[:, :, None] + reach[:, None] * np.array([np.cos(angle), np.sin(angle)])[:, None]))
-                for reach in (0.5 * radius_px, 2 * radius_px + 3)
-            )
-            difference: Float = on.mean(1) - np.median(around, axis=1)
+        on, around = (
+            position_px.T[:, :, None] + reach[:, None] * np.array([np.cos(angle), np.sin(angle)])[:, None]
+            for reach in (0.5 * radius_px, 2 * radius_px + 3)
+        )
+
+        def contrast(image: Callable[[Float, Float], Float]) -> Float:
+            difference: Float = image(*on).mean(1) - np.median(image(*around), axis=1)
             return difference
 
-        ours, all_of_it = contrast(self.canvas), contrast(film)
+        ours, all_of_it = contrast(self), contrast(lambda cols, rows: _at(film, cols, rows))
         return np.asarray((np.abs(ours) > 0) & (np.abs(all_of_it - ours) < (1 - _EXPLAINED) * np.abs(ours)))
 
 
-def paint(shape: tuple[int, ...], needles: list[tuple[NeedleFit, Optics]]) -> Painted:
-    """Paint needles, each with its optics, on an empty film of this shape."""
-    canvas = np.zeros(shape, np.float32)
-    for fit, optics in needles:
-        half = int(np.ceil(fit.shape.length_px + fit.shape.half_width_px + _BLURS * optics.sigma_px)) + 1
-        col, row = np.rint(fit.position_px).astype(np.intp)
-        cols, rows = (np.arange(max(at - half, 0), min(at + half + 1, n)) for at, n in ((col, shape[1]), (row, shape[0])))
-        dx, dy = cols - fit.position_px[0], rows - fit.position_px[1]
-        i, j = np.nonzero(support(dx, dy, fit.angles, fit.shape, _BLURS * optics.sigma_px + 1))
-        canvas[rows[i], cols[j]] += needle_image(dx[j], dy[i], fit, optics)
-    return Painted(canvas)
+def paint(needles: list[tuple[NeedleFit, Optics]]) -> Painted:
+    """Paint needles, each with its optics."""
+    half = max(int(np.ceil(f.shape.length_px + f.shape.half_width_px + _BLURS * optics.sigma_px)) + 1 for f, optics in needles)
+    corner = np.rint([f.position_px for f, _ in needles]).astype(np.intp) - half
+    images = np.zeros((len(needles), 2 * half + 1, 2 * half + 1), np.float32)
+    axis = np.arange(2.0 * half + 1)
+    for image, first, (fit, optics) in zip(images, corner, needles, strict=True):
+        dx, dy = (axis + (begin - at) for begin, at in zip(first, fit.position_px, strict=True))
+        row, col = np.nonzero(support(dx, dy, fit.angles, fit.shape, _BLURS * optics.sigma_px + 1))
+        image[row, col] = needle_image(dx[col], dy[row], fit, optics)
+    return Painted(corner, images)
 
 
 def _at(image: NDArray[Any], cols: Float, rows: Float) -> Float:

@@ -53,7 +53,11 @@ def cut(film: NDArray[Any], centres_px: Float, half: int, noise: NoiseModel) -> 
     Patches
     """
     corner = np.rint(centres_px).astype(np.int64) - half
-    step = np.arange(2 * half + 1)
+    side = 2 * half + 1
+    if len(corner) and corner.min() >= 0 and (corner.max(0) + side <= film.shape[::-1]).all():
+        values = np.array([film[row : row + side, col : col + side] for col, row in corner.tolist()], np.float64)
+        return Patches(values, (values > noise.floor) & (values < noise.ceiling), corner)
+    step = np.arange(side)
     cols = corner[:, 0, None] + step
     rows = corner[:, 1, None] + step
     inside_c = (cols >= 0) & (cols < film.shape[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from rsa_vision.detect.crossing import chi2_of, window_of
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
-from rsa_vision.detect.needle_sets import TAPERS, fit_all
+from rsa_vision.detect.needle_sets import MOST_TOGETHER, TAPERS, fit_all
 from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
@@ -64,8 +65,10 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
             continue  # the same stroke, seen by another filter
         tried = np.append(tried, [[col, row]], axis=0)
         in_vain += 1
-        fits = []
+        fits: list[NeedleFit] = []
         for turn in (angle, angle + np.pi):
+            if fits and _left(fits[0]) < _CLOSE_FIT:
+                break
             start = NeedleShape(max(0.9, 0.5 * width), 1.45 * length, TAPERS[0])  # the answer fades before the tip
             tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
             fits.append(fit_needles(film, tip, np.array([turn]), start, guess, noise, quick=True))
@@ -118,7 +121,7 @@ def find_pins(
         for f, shapes in zip(rough, starts, strict=True)
     ]
     pins = _pointed(film, _distinct([f for f in pins if is_pin(f)]), optics, noise)
-    pins = [f for f in fit_all(film, pins, optics, noise, again=True) if is_pin(f)]
+    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
     return [_less_sure_along(f, np.hypot(along_px, _POINT * f.shape.half_width_px)) for f in pins if is_pin(f)], optics
 
@@ -263,18 +266,19 @@ def _left(fit: NeedleFit) -> float:
 def _distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
     for fit in sorted(pins, key=_left):
-        if all(np.hypot(*(fit.position_px - k.position_px)) > _NEAREST_PX and not _same_body(fit, k) for k in kept):
+        if all(math.dist(fit.position_px, k.position_px) > _NEAREST_PX and not _same_body(fit, k) for k in kept):
             kept.append(fit)
     return kept
 
 
 def _same_body(a: NeedleFit, b: NeedleFit) -> bool:
     """Say whether two fits lie on the same stroke, perhaps the other way round."""
-    return bool(np.hypot(*(_middle(a) - _middle(b))) < 0.25 * a.shape.length_px)
+    return math.dist(_middle(a), _middle(b)) < 0.25 * a.shape.length_px
 
 
 def _middle(fit: NeedleFit) -> Float:
-    middle: Float = fit.position_px + 0.5 * fit.shape.length_px * np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
+    half, angle = 0.5 * fit.shape.length_px, float(fit.angles[0])
+    middle: Float = fit.position_px + half * np.array([math.cos(angle), -math.sin(angle)])
     return middle
 
 

@@ -15,9 +15,10 @@ from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear
-from rsa_vision.detect.find import DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
+from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.spots import find_spot, with_spot
 from rsa_vision.types import Bool, Float, Int
@@ -44,7 +45,7 @@ def resolve_balls(
     limit: float,
     optics: Optics,
     noise: NoiseModel,
-    tees: Background | None,
+    needles: Painted | None,
 ) -> tuple[BallFits, Bool, Bool, Bool]:
     """Fit all balls of a film.
 
@@ -59,7 +60,7 @@ def resolve_balls(
         Significance that a mark must have.
     optics : Optics
     noise : NoiseModel
-    tees : callable, optional
+    needles : Painted, optional
         Images of pins and tees, to be subtracted.
 
     Returns
@@ -73,9 +74,13 @@ def resolve_balls(
     drawn : ndarray of bool, shape (n,)
         Fitted with the film's focal spot.
     """
+    worth = ~hopeless(seeds, COARSE_SIGMA_PX, noise)
+    if needles is not None and np.count_nonzero(look_clear(seeds, noise)) >= LEAST_KNOWN:  # else these too are asked what balls are like
+        worth &= ~needles.explain(film, seeds.position_px, seeds.radius_px)
+    seeds = seeds.rows(worth)
     if len(seeds.depth) == 0:
         return seeds, np.zeros(0, bool), np.zeros(0, bool), np.zeros(0, bool)
-    needles = tees
+    tees: Background | None = needles
     others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
@@ -97,9 +102,8 @@ def resolve_balls(
         fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     sure = single.rows(clean)
-    nobody = np.arange(0)
     blobs = single.rows(~clean & ~_taken(single, sure))
-    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: _beside(sure, nobody, optics, tees))
+    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: _beside(sure, np.arange(0), optics, tees))
     fits += pairs
     if pairs:  # a blob that two balls explain is no ball
         good = good.rows(~_taken(good, join(pairs)))
@@ -126,10 +130,9 @@ def resolve_balls(
     found, edged = _beside_edges(film, distinct(found.rows(~_taken(found, drawn)), noise), optics, noise, tees)
     by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)
     found, edged = join([found, drawn]), np.append(edged, np.zeros(len(drawn.depth), bool))
-    near = [len(g) > 1 for g in _groups(found, optics)]
     touching = np.zeros(len(found.depth), bool)
-    for g, several in zip(_groups(found, optics), near, strict=True):
-        touching[g] = several
+    for g in _groups(found, optics):
+        touching[g] = len(g) > 1
     return found, touching, edged, by_spot
 
 
@@ -140,22 +143,22 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
     is added to the stated error, since edges bend and have other profiles than the model's.
     """
     parts, edged_too = [fits.rows(slice(0))], []
+    worth = ~hopeless(fits, optics.sigma_px, noise)
     for g in _groups(fits, optics):
         index = np.array(g)
         edged_too.append(np.zeros(len(g), bool))
         beside = _beside(fits, index, optics, tees)
         plain = fits.rows(index)
         # a size at the limit is not fitted: nothing that comes to rest there is a ball
-        if len(g) > _MOST_IN_GROUP or (plain.radius_px >= RADIUS_PX[1]).any():
+        if len(g) > _MOST_IN_GROUP or not worth[index].any() or (plain.radius_px >= RADIUS_PX[1]).any():
             parts.append(plain)
             continue
-        start, radius = plain.position_px, plain.radius_px
         foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside) / noise.correlation.sum()
         if foreseen < _FORESEEN * EDGE_GAIN:
             parts.append(plain)
             continue
-        flat = fit_group(film, start, radius, optics.sigma_px, optics.mu_px, noise, beside)
-        edged = fit_group(film, start, radius, optics.sigma_px, optics.mu_px, noise, beside, edge=True)
+        flat = fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside)
+        edged = fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, edge=True)
         gain = 2 * (edged.log_likelihood[0] - flat.log_likelihood[0]) / noise.correlation.sum()
         if gain < EDGE_GAIN or not edged.converged.all():
             parts.append(plain)
@@ -237,8 +240,6 @@ def _lapping(fits: BallFits) -> Bool:
 
 def _taken(fits: BallFits, good: BallFits) -> Bool:
     """Say which fits lie on a ball that is already known."""
-    if len(good.depth) == 0:
-        return np.zeros(len(fits.depth), bool)
     gap = np.hypot(*(fits.position_px[:, None] - good.position_px[None]).transpose(2, 0, 1))
     return np.asarray((gap < 0.6 * good.radius_px[None]).any(axis=1))
 
@@ -333,8 +334,7 @@ def _deep(film: NDArray[Any], peaks: Float, radius: float, tees: Background | No
     middle = film[row.clip(0, film.shape[0] - 1), col.clip(0, film.shape[1] - 1)].astype(np.float64)
     if tees is not None:
         middle -= tees(*peaks.T)
-    out: Float = np.abs(middle - np.median(film[rows, cols], axis=1))
-    return out
+    return np.asarray(np.abs(middle - np.median(film[rows, cols], axis=1)))
 
 
 def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:

@@ -38,8 +38,8 @@ def find_strokes(answer: NDArray[Any], place: Int, strength: Float, level: int) 
     Returns
     -------
     ndarray of shape (n, 6)
-        col_px, row_px of the middle, angle of the axis (radians, counter-clockwise as displayed), length and width in film pixels, strength
-        (the largest of an island); negative strength for bright marks.
+        col_px, row_px of the middle, angle of the axis towards the thicker end (radians, counter-clockwise as displayed), length and width
+        in film pixels, strength (the largest of an island); negative strength for bright marks.
     """
     r, c = np.divmod(place, answer.shape[1])
     weight = answer.ravel()[place].astype(np.float64)
@@ -81,9 +81,10 @@ def _one_polarity(r: Int, c: Int, weight: Float, over: Float, level: int, sign: 
     xx, yy, xy = mean(dx * dx) + 1 / 12, mean(dy * dy) + 1 / 12, mean(dx * dy)
     middle, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     length, width = (np.sqrt(12 * np.maximum(m, 0.0)) * size for m in (middle + apart, middle - apart))
-    rows: Float = np.stack(
-        [(x + 0.5) * size - 0.5, (y + 0.5) * size - 0.5, 0.5 * np.arctan2(2 * xy, xx - yy), length, width, sign * strength], axis=1
-    )
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    along = dx * np.cos(angle)[island] + dy * np.sin(angle)[island]
+    angle += np.pi * (mean(along**3) > 0)  # the answer fades out towards the tip
+    rows: Float = np.stack([(x + 0.5) * size - 0.5, (y + 0.5) * size - 0.5, angle, length, width, sign * strength], axis=1)
     seen = (side > LENGTHS_PX[0] / 2) & (side < LENGTHS_PX[1])
     slim: Float = rows[seen & (length > SLIM * width) & (length > LENGTHS_PX[0]) & (length < LENGTHS_PX[1])]
     return slim

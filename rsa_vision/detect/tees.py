@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,13 +15,13 @@ from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MIS
 from rsa_vision.detect.junctions import RINGS_PX
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
-from rsa_vision.detect.needle_sets import TAPERS, fit_all, others_beside
+from rsa_vision.detect.needle_sets import MOST_TOGETHER, TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared
-from rsa_vision.detect.templates import SCALE, find_like, template_of
+from rsa_vision.detect.templates import SCALE, find_like, promising, template_of
 from rsa_vision.detect.twins import split_twins
 from rsa_vision.types import Float
 
@@ -60,10 +61,10 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     if not models:
         return [], [], optics
     tees = _like(film, models, optics, noise)
-    for again in (False, True):
+    for again in (1, MOST_TOGETHER):
         tees = _distinct(fit_all(film, tees, optics, noise, again=again), models[0])
     if under := _outshone(film, tees, models[0], optics, noise):
-        tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=True), models[0])
+        tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=MOST_TOGETHER), models[0])
     if not tees:
         return [], [], optics
     around = tees
@@ -143,7 +144,7 @@ def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Op
     for col, row, angle, ring, _ in junctions:
         start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
         angles = angle + np.array([0.0, np.pi / 2, -np.pi / 2])
-        fit = fit_needles(film, np.array([col, row]), angles, start, optics, noise, rigid=True)
+        fit = fit_needles(film, np.array([col, row]), angles, start, optics, noise)
         if is_tee(fit, slack=ROUGH):
             rough.append(fit)
         if sum(is_tee(f) for f in rough) >= ENOUGH:
@@ -159,6 +160,8 @@ def _mean_misfit(fits: list[NeedleFit]) -> float:
 def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Starts at every place that looks like one of the models."""
     found = [find_like(film, template_of(m, optics)) for m in models]
+    # what brighter tees hide here is found once these are known
+    found = [places[promising(film, places, m, optics, noise)] for m, places in zip(models, found, strict=True)]
     model = np.repeat(np.arange(len(models)), [len(f) for f in found])
     places = np.concatenate(found)
     starts: list[NeedleFit] = []
@@ -173,14 +176,15 @@ def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: No
 def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Find faint tees whose arms reach among those of brighter ones: what the film looks like without these."""
     starts: list[tuple[float, NeedleFit]] = []
-    painted, seen = paint(film.shape, [(t, optics) for t in tees]), template_of(model, optics)
+    painted, seen = paint([(t, optics) for t in tees]), template_of(model, optics)
     for tee in tees:
         half = int(2.5 * tee.shape.length_px)
         left, top = (max(int(x) - half, 0) // SCALE * SCALE for x in tee.position_px)
-        box = slice(top, top + 2 * half), slice(left, left + 2 * half)
-        for col, row, likeness in find_like(film[box] - painted.canvas[box], seen):
+        box = film[top : top + 2 * half, left : left + 2 * half]
+        rows, cols = np.mgrid[top : top + box.shape[0], left : left + box.shape[1]]
+        for col, row, likeness in find_like(box - painted(cols, rows), seen):
             place = np.array([col + left, row + top])
-            if min(np.hypot(*(t.position_px - place)) for t in tees) > _NEAREST_PX:
+            if min(math.dist(t.position_px, place) for t in tees) > _NEAREST_PX:
                 starts.append((likeness, replace(model, position_px=place)))
     best = [start for _, start in sorted(starts, key=lambda item: -item[0])]
     return _peeled(film, best, optics, noise, tees)[len(tees) :]
@@ -199,8 +203,8 @@ def _peeled(
         others = others_beside(start, kept, optics)
         fit = fit_crossing(film, [start], optics, noise, others=others, quick=True)[0]
         deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > _FAINTEST * abs(start.depth)
-        near = np.hypot(*(fit.position_px - start.position_px)) < 2 * _NEAREST_PX
-        if deep and near and is_tee(fit, slack=ROUGH) and all(np.hypot(*(k.position_px - fit.position_px)) > _NEAREST_PX for k in kept):
+        near = math.dist(fit.position_px, start.position_px) < 2 * _NEAREST_PX
+        if deep and near and is_tee(fit, slack=ROUGH) and all(math.dist(k.position_px, fit.position_px) > _NEAREST_PX for k in kept):
             kept.append(fit)
             in_vain = 0
     return kept
@@ -210,6 +214,6 @@ def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
     for fit in sorted(tees, key=lambda f: f.misfit + 1 - f.explained):
         deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > _FAINTEST * abs(model.depth)
-        if deep and is_tee(fit, slack=ROUGH) and all(np.hypot(*(fit.position_px - k.position_px)) > _NEAREST_PX for k in kept):
+        if deep and is_tee(fit, slack=ROUGH) and all(math.dist(fit.position_px, k.position_px) > _NEAREST_PX for k in kept):
             kept.append(fit)
     return kept
