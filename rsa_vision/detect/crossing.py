@@ -15,6 +15,7 @@ from rsa_vision.detect.needles import PROMISING, between, explains, scored, step
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.whitening import whiten
 from rsa_vision.types import Float
 
 _STEPS, _QUICK_STEPS = 16, 5
@@ -54,6 +55,11 @@ class Window:
         at = (self.rows - self.corner_px[1]).astype(np.intp), (self.cols - self.corner_px[0]).astype(np.intp)
         out[:, *at] = values
         return out
+
+    def whiten(self, values: Float, noise: NoiseModel) -> Float:
+        """Filter values at the pixels, in units of the noise, shape (p, n), so that the noise in them is white."""
+        at = (self.rows - self.corner_px[1]).astype(np.intp), (self.cols - self.corner_px[0]).astype(np.intp)
+        return np.asarray(whiten(self.square(values), noise)[:, *at])
 
 
 def window_of(

@@ -75,6 +75,12 @@ class Equations:
         """Change of the own parameters, shape (p,), that goes with one of the common ones."""
         return np.asarray(self.own_alone - self.own_by_common @ change, np.float64)
 
+    def in_white_noise(self, window: Window, noise: NoiseModel) -> Equations:
+        """Return the same by generalised least squares."""
+        white = window.whiten(np.concatenate([self.own, self.common, self.residual[None]]), noise)
+        own, common, residual = white[: len(self.own)], white[len(self.own) : -1], white[-1]
+        return replace(self, own=own, common=common, residual=residual, normal=white[:-1] @ white[:-1].T)
+
     @property
     def tips(self) -> Int:
         """Places of the coordinates of the tips among the own parameters."""

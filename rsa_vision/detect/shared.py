@@ -112,10 +112,14 @@ def fit_shared(
         sizes = replace(sizes, typical=sizes.typical + change[OPTICS:SHARED])
         if alike and step + 1 == _SIZES_AFTER:
             sizes, converged = _sizes(systems, sets), False
+    systems = [e.in_white_noise(w, noise) for e, w in zip(systems, windows, strict=True)]
+    told = [e.information() for e in systems]
+    normal = precision + sum(matrix for matrix, _ in told)
+    change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
     errors = _common_errors(windows, systems, normal, precision, noise)
     out = []
     for window, e in zip(windows, systems, strict=True):
-        out += _finished(window, e, errors, optics, noise, converged)
+        out += _finished(window, e, e.step(change)[e.tips].reshape(-1, 2), errors, optics, noise, converged)
     return out, optics
 
 
@@ -182,7 +186,7 @@ def _common_errors(windows: list[Window], systems: list[Equations], normal: Floa
     for window, e in zip(windows, systems, strict=True):
         unexplained = e.common - e.own_by_common.T @ e.own
         spread += (
-            influence_covariance(window.square(unexplained), noise.correlation)
+            influence_covariance(window.square(window.whiten(unexplained, noise)), noise.correlation)
             + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)
         ) / e.excess
     inverse = np.linalg.inv(normal)
@@ -190,16 +194,16 @@ def _common_errors(windows: list[Window], systems: list[Equations], normal: Floa
     return covariance
 
 
-def _finished(window: Window, e: Equations, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
+def _finished(window: Window, e: Equations, move: Float, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
     to_tips = e.inverse[e.tips] @ e.own
     by_common = e.own_by_common[e.tips]
-    covariance = influence_covariance(window.square(to_tips), noise.correlation) + by_common @ errors @ by_common.T
+    covariance = influence_covariance(window.square(window.whiten(to_tips, noise)), noise.correlation) + by_common @ errors @ by_common.T
     of_prior = e.inverse[e.tips] * e.prior  # what is held near to the expected is not exactly there
     covariance = covariance + of_prior @ of_prior.T
     variance = float(noise.variance_at(np.array([e.background]))[0])
     out = []
     for i, (fit, image) in enumerate(zip(e.members, e.images, strict=True)):
         at = slice(2 * i, 2 * i + 2)
-        fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
+        fit = replace(fit, position_px=fit.position_px + move[i], covariance_px2=covariance[at, at], converged=converged)
         out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance))
     return out
