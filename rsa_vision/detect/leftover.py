@@ -14,7 +14,7 @@ from rsa_vision.types import Bool, Float
 _FITTED = 4  # parameters that ``uneven`` counts off
 _AT_RIM = 0.7  # the rim, which tells the centre, lies at half the depth; the mean of all that is under a ball at seven tenths
 _OUTLIER = 3.0  # times the median
-_LEAST = 8  # balls, and places, that tell something
+LEAST = 8  # marks, and places, that tell something
 _NOTHING = 0.01  # places leave less only where there is no noise
 _MOST = 0.4, 2.5  # what they may tell
 
@@ -40,18 +40,24 @@ def noise_under(uneven: Float, radius_px: Float, quiet: float, places: list[Plac
     float
         One where too few tell.
     """
-    if len(uneven) < _LEAST:
+    if len(uneven) < LEAST:
         return 1.0
     usual_half = half_size(float(np.median(radius_px)), optics.sigma_px)
     left = [_uneven(these, float(np.median(radius_px)), quiet, optics, noise) for these in places if abs(these.half - usual_half) <= 1]
     beside = np.concatenate([np.zeros(0), *left])
-    if len(beside) < _LEAST:
+    if len(beside) < LEAST:
         return 1.0
-    usual = _usual(beside)
-    return float(np.clip((_usual(uneven) / usual) ** _AT_RIM, *_MOST)) if usual > _NOTHING else 1.0
+    usual = usual_square(beside)
+    return at_rims(usual_square(uneven) / usual) if usual > _NOTHING else 1.0
 
 
-def _usual(squares: Float) -> float:
+def at_rims(under: float) -> float:
+    """Return the variance at the rims of marks, given that under them, in units of that beside them."""
+    return float(np.clip(under**_AT_RIM, *_MOST))
+
+
+def usual_square(squares: Float) -> float:
+    """Return the mean of those that are not far beyond the median."""
     return float(squares[squares <= _OUTLIER * np.median(squares)].mean())
 
 

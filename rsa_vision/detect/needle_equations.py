@@ -21,6 +21,7 @@ OF_SLANTS = {
     1: np.eye(2),
     3: np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0, 0, -1]]),
 }
+_CORE = 0.3  # of the largest depth, from which a pixel is under a needle
 _RIDGE = 1e-4  # relative: keeps what the pixels do not determine where it is
 
 
@@ -80,6 +81,14 @@ class Equations:
         white = window.whiten(np.concatenate([self.own, self.common, self.residual[None]]), noise)
         own, common, residual = white[: len(self.own)], white[len(self.own) : -1], white[-1]
         return replace(self, own=own, common=common, residual=residual, normal=white[:-1] @ white[:-1].T)
+
+    def under(self, own: Float, common: Float) -> float:
+        """Mean square of what is left under the needles once these changes are made, over what the fit lets white noise leave there."""
+        left = self.residual - own @ self.own - common @ self.common
+        leverage = np.einsum("pn,pn->n", self.own, self.inverse @ self.own)
+        image = np.abs(np.sum(self.images, axis=0))
+        core = image > _CORE * image.max()
+        return float(np.square(left[core]).sum() / (1 - leverage[core]).sum())
 
     @property
     def tips(self) -> Int:

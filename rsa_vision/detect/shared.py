@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.alike import true_spread
 from rsa_vision.detect.crossing import Window, window_of
+from rsa_vision.detect.leftover import LEAST, at_rims, usual_square
 from rsa_vision.detect.needle_equations import OF_SLANTS, OPTICS, SHARED, SLANT, Equations, by_optics, linearise
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_sets import clusters, others_beside
@@ -116,10 +117,14 @@ def fit_shared(
     told = [e.information() for e in systems]
     normal = precision + sum(matrix for matrix, _ in told)
     change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
-    errors = _common_errors(windows, systems, normal, precision, noise)
+    moves = [e.step(change) for e in systems]
+    left = np.array([e.under(own, change) for e, own in zip(systems, moves, strict=True)])
+    # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
+    under = at_rims(min(usual_square(left), 1.0)) if len(needles) >= LEAST else 1.0
+    errors = _common_errors(windows, systems, normal, precision, noise, under)
     out = []
-    for window, e in zip(windows, systems, strict=True):
-        out += _finished(window, e, e.step(change)[e.tips].reshape(-1, 2), errors, optics, noise, converged)
+    for window, e, own in zip(windows, systems, moves, strict=True):
+        out += _finished(window, e, own[e.tips].reshape(-1, 2), errors, optics, noise, under, converged)
     return out, optics
 
 
@@ -180,13 +185,15 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
     return out
 
 
-def _common_errors(windows: list[Window], systems: list[Equations], normal: Float, precision: Float, noise: NoiseModel) -> Float:
+def _common_errors(
+    windows: list[Window], systems: list[Equations], normal: Float, precision: Float, noise: NoiseModel, under: float
+) -> Float:
     """Covariance of the common parameters, for noise that neighbouring pixels share."""
     spread = precision.copy()
     for window, e in zip(windows, systems, strict=True):
         unexplained = e.common - e.own_by_common.T @ e.own
         spread += (
-            influence_covariance(window.square(window.whiten(unexplained, noise)), noise.correlation)
+            under * influence_covariance(window.square(window.whiten(unexplained, noise)), noise.correlation)
             + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)
         ) / e.excess
     inverse = np.linalg.inv(normal)
@@ -194,10 +201,12 @@ def _common_errors(windows: list[Window], systems: list[Equations], normal: Floa
     return covariance
 
 
-def _finished(window: Window, e: Equations, move: Float, errors: Float, optics: Optics, noise: NoiseModel, converged: bool) -> list[NeedleFit]:
+def _finished(
+    window: Window, e: Equations, move: Float, errors: Float, optics: Optics, noise: NoiseModel, under: float, converged: bool
+) -> list[NeedleFit]:
     to_tips = e.inverse[e.tips] @ e.own
     by_common = e.own_by_common[e.tips]
-    covariance = influence_covariance(window.square(window.whiten(to_tips, noise)), noise.correlation) + by_common @ errors @ by_common.T
+    covariance = under * influence_covariance(window.square(window.whiten(to_tips, noise)), noise.correlation) + by_common @ errors @ by_common.T
     of_prior = e.inverse[e.tips] * e.prior  # what is held near to the expected is not exactly there
     covariance = covariance + of_prior @ of_prior.T
     variance = float(noise.variance_at(np.array([e.background]))[0])
