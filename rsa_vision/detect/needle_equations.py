@@ -21,6 +21,7 @@ OF_SLANTS = {
     1: np.eye(2),
     3: np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0, 0, -1]]),
 }
+_OF_PRODUCT = 0.1  # how far off it is
 _CORE = 0.3  # of the largest depth, from which a pixel is under a needle
 _RIDGE = 1e-4  # relative: keeps what the pixels do not determine where it is
 
@@ -179,8 +180,12 @@ def linearise(
             turning,
             -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected,
         ]
-    linear = [*(b[0] for b in blocks), *lapping([b[0].sum(0) for b in blocks]), surface]
+    lapped = lapping([b[0].sum(0) for b in blocks])
+    linear = [*(b[0] for b in blocks), *lapped, surface]
     root = np.sqrt(weight)
+    if lapped:  # the product of two blurred shadows is not quite what the film shows of both
+        deepest = max(abs(f.depth) for f in members)
+        root = 1 / np.hypot(1 / root, _OF_PRODUCT * deepest * lapped[0][0])
     rows = np.concatenate([*moves, *linear, common]) * root
     normal = rows @ rows.T
     p, n_linear = len(rows) - len(common), sum(len(rows_) for rows_ in linear)

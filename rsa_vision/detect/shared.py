@@ -206,7 +206,8 @@ def _finished(
 ) -> list[NeedleFit]:
     to_tips = e.inverse[e.tips] @ e.own
     by_common = e.own_by_common[e.tips]
-    covariance = under * influence_covariance(window.square(window.whiten(to_tips, noise)), noise.correlation) + by_common @ errors @ by_common.T
+    covariance = under * influence_covariance(window.square(window.whiten(to_tips, noise)), noise.correlation)
+    covariance = covariance + by_common @ errors @ by_common.T
     of_prior = e.inverse[e.tips] * e.prior  # what is held near to the expected is not exactly there
     covariance = covariance + of_prior @ of_prior.T
     variance = float(noise.variance_at(np.array([e.background]))[0])
