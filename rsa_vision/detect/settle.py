@@ -38,6 +38,7 @@ _NONE = 1e-3  # of the noise, or of a promised error: what is not there
 _QUIETEST = 0.6  # of a promised squared error
 _ROUNDED = 1.0  # variance of noise up to which areas have one value
 _STEPS = 4  # from where the fit on a quadratic background came to rest
+_AFRESH = (0, 2)  # those with new derivatives
 _MAX_STEP_PX = 0.7
 _FIXED = 1e6  # inverse variance of a radius that is not fitted
 _OUTLIER = 3.0  # standard deviations from which a ball has a size of its own
@@ -217,7 +218,7 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
     rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
     surface = np.concatenate([polynomial(half, cols - half, rows - half), known.surface], axis=1).T
     local, radius, depth = fits.position_px - windows.corner_px, fits.radius_px, fits.depth
-    theta = np.zeros((len(depth), len(surface)))
+    theta, side = np.zeros((len(depth), len(surface))), 2 * half + 1
     target, held = _hold(fits, common)
     precision = np.zeros((len(depth), 4 + len(surface)))
     precision[:, 2], precision[:, _PER_BALL:] = held, _precision(known, structure, fits, noise)
@@ -226,18 +227,20 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         shapes = slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, sigma_px)
         value, *by = (shape.astype(np.float64) for shape in shapes)
         ball = depth[:, None] * value
-        # a mark takes away its part of what is there: on linear films more where there is more
-        shade = 1 + common.proportion.slope * value[:, None]
-        curves = surface * shade
-        curves[:, 0] = surface[0]
-        images = np.concatenate([np.stack([-depth[:, None] * by[0], -depth[:, None] * by[1], depth[:, None] * by[2], value], 1), curves], 1)
         left = windows.data - ball
-        weight = windows.valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
-        root = np.sqrt(weight)[:, None]
-        whole = np.concatenate([images, left[:, None]], axis=1) * root
-        white = whiten(whole.reshape(*whole.shape[:2], 2 * half + 1, -1), noise).reshape(whole.shape)
-        seen = white[:, :-1]
-        normal, right = np.matmul(seen, seen.swapaxes(1, 2)), np.matmul(seen, white[:, -1, :, None])[:, :, 0]
+        if step in _AFRESH:
+            # a mark takes away its part of what is there: on linear films more where there is more
+            shade = 1 + common.proportion.slope * value[:, None]
+            curves = surface * shade
+            curves[:, 0] = surface[0]
+            moves = [-depth[:, None] * by[0], -depth[:, None] * by[1], depth[:, None] * by[2], value]
+            images = np.concatenate([np.stack(moves, axis=1), curves], axis=1)
+            weight = windows.valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
+            root = np.sqrt(weight)[:, None]
+            seen = whiten((images * root).reshape(*images.shape[:2], side, side), noise).reshape(images.shape)
+            plain = np.matmul(seen, seen.swapaxes(1, 2))
+        white = whiten((left[:, None] * root).reshape(-1, side, side), noise).reshape(len(depth), -1, 1)
+        normal, right = plain.copy(), np.matmul(seen, white)[:, :, 0]
         if step == 1:  # once the background is known roughly
             own = _own_share(normal, right, precision[:, _PER_BALL:], common.differ)
             structure = structure * own[:, None]
@@ -251,7 +254,7 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
         residual = left - np.matmul(change[:, None], images)[:, 0]
-    estimator = np.matmul(inverse[:, :2], seen).reshape(len(depth), 2, 2 * half + 1, -1)
+    estimator = np.matmul(inverse[:, :2], seen).reshape(len(depth), 2, side, side)
     estimator = whiten(estimator, noise).reshape(len(depth), 2, -1) * root
     return _Solution(local, radius, estimator, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure)
 
