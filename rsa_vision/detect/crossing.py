@@ -58,8 +58,10 @@ class Window:
 
     def whiten(self, values: Float, noise: NoiseModel) -> Float:
         """Filter values at the pixels, in units of the noise, shape (p, n), so that the noise in them is white."""
-        at = (self.rows - self.corner_px[1]).astype(np.intp), (self.cols - self.corner_px[0]).astype(np.intp)
-        return np.asarray(whiten(self.square(values), noise)[:, *at])
+        at = (self.rows - self.rows.min()).astype(np.intp), (self.cols - self.cols.min()).astype(np.intp)
+        box = np.zeros((len(values), *(int(axis.max()) + 1 for axis in at)))
+        box[:, *at] = values
+        return np.asarray(whiten(box, noise)[:, *at])
 
 
 def window_of(

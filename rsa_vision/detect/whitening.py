@@ -17,6 +17,7 @@ from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Float
 
 _REACH = 4  # pixels; a longer filter does no better
+_NOTHING = 3e-3  # of the filter's middle, from which a tap counts
 _PERIOD = 64
 _LEAST_POWER = 0.1  # of white noise of the same variance: no frequency is known to have less, and blur is not known so well
 
@@ -26,24 +27,23 @@ def whiten(images: Float, noise: NoiseModel) -> Float:
 
     Parameters
     ----------
-    images : ndarray of shape (..., s, s)
+    images : ndarray of shape (..., rows, cols)
         In units of the noise of each pixel; 0 where masked.
     noise : NoiseModel
 
     Returns
     -------
-    ndarray of shape (..., s, s)
+    ndarray of shape (..., rows, cols)
         The filter is its own transpose.
     """
     if noise.is_white:
         return images
-    side = images.shape[-1]
-    rows = images.reshape(-1, side, side)
-    apart = np.zeros((len(rows), side + _REACH, side))
-    apart[:, :side] = rows
+    rows, cols = images.shape[-2:]
     kernel = _kernel(noise.correlation.tobytes(), len(noise.correlation))
-    out = cv2.filter2D(apart.reshape(-1, side), cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(out.reshape(apart.shape)[:, :side].reshape(images.shape))
+    apart = np.zeros((images.size // (rows * cols), rows + len(kernel) // 2, cols))
+    apart[:, :rows] = images.reshape(-1, rows, cols)
+    out = cv2.filter2D(apart.reshape(-1, cols), cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(out.reshape(apart.shape)[:, :rows].reshape(images.shape))
 
 
 @lru_cache(maxsize=64)
@@ -53,4 +53,5 @@ def _kernel(correlation: bytes, side: int) -> NDArray[np.float64]:
     power = np.fft.rfft2(np.roll(wrapped, (-(side // 2), -(side // 2)), (0, 1))).real
     power += max(0.0, _LEAST_POWER - power.min())
     kernel = np.fft.irfft2(1 / np.sqrt(power), s=wrapped.shape)
-    return np.asarray(np.roll(kernel, (_REACH, _REACH), (0, 1))[: 2 * _REACH + 1, : 2 * _REACH + 1].copy())
+    reach = int(np.flatnonzero(np.abs(kernel[0, : _REACH + 1]) > _NOTHING * kernel[0, 0]).max())
+    return np.asarray(np.roll(kernel, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1].copy())
