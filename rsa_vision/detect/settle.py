@@ -278,6 +278,7 @@ def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) ->
     core = distance < (found.radius_px + common.optics.sigma_px)[:, None]
     under, ring = (uneven_white(found.residual, found.weight, found.local_px, side, where, common.noise) for where in (core, ~core))
     left = (found.weight * found.residual**2 * core).sum(axis=1) / np.maximum((core & (found.weight > 0)).sum(axis=1), 1)
+    left = np.minimum(left, fits.chi2_core)  # a fit that is the best in correlated noise leaves more of slow changes
     position = found.local_px + windows.corner_px
     return replace(fits, position_px=position, covariance=covariance, chi2_core=left, chi2_uneven=under, chi2_ring=ring)
 
