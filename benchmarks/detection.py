@@ -10,6 +10,9 @@ their columns. On bone the bound knows nothing of the background's curvature, an
 *robust*: the same ratio from the median instead of the mean square. *flagged*: with any flag but `overlap`; *beyond 4 sd, unflagged*: the
 confident wrong ones. Rivals measure the first film only. On pins and tees they are given the direction and the constant part of their
 error, so that their ratio can be below 1, and only detections beyond one for each pin, arm and ball count as false.
+
+Of the pig's beads, labelled by hand in half pixels, *SD about the epipolar geometry* is that of one coordinate in all frames, with one
+fundamental matrix for them: no label enters ours, and what it comes to over what we state should be one.
 """
 
 from __future__ import annotations
