@@ -63,10 +63,10 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     tees = _like(film, models, optics, noise)
     for again in (1, MOST_TOGETHER):
         tees = _distinct(fit_all(film, tees, optics, noise, again=again), models[0])
-    if under := _outshone(film, tees, models[0], optics, noise):
-        tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=MOST_TOGETHER), models[0])
     if not tees:
         return [], [], optics
+    if under := _outshone(film, tees, models[0], optics, noise):
+        tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=MOST_TOGETHER), models[0])
     around = tees
 
     def beside(mine: list[NeedleFit]) -> Any:
