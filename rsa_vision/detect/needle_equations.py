@@ -84,12 +84,13 @@ class Equations:
         return replace(self, own=own, common=common, residual=residual, normal=white[:-1] @ white[:-1].T)
 
     def under(self, own: Float, common: Float) -> float:
-        """Mean square of what is left under the needles once these changes are made, over what the fit lets white noise leave there."""
-        left = self.residual - own @ self.own - common @ self.common
+        """Mean square of what is left under the needles once these changes are made over that beside them, each over what a fit leaves."""
+        square = np.square(self.residual - own @ self.own - common @ self.common)
         leverage = np.einsum("pn,pn->n", self.own, self.inverse @ self.own)
         image = np.abs(np.sum(self.images, axis=0))
         core = image > _CORE * image.max()
-        return float(np.square(left[core]).sum() / (1 - leverage[core]).sum())
+        under, beside = (square[where].sum() / (1 - leverage[where]).sum() for where in (core, ~core))
+        return float(under / beside)
 
     @property
     def tips(self) -> Int:

@@ -45,6 +45,8 @@ _OUTLIER = 3.0  # standard deviations from which a ball has a size of its own
 _QUARTILE, _OF_CHANCE = 0.75, 2.773  # the upper one, of chi2 with two degrees of freedom: errors by bone have longer tails than it
 _PER_BALL = 10  # centre, radius, depth, and the six coefficients of a quadratic surface
 _BATCH = 20
+_USUAL = 6.0  # of chi2 with two degrees of freedom: 95 of 100 are less
+_LEAST_CHANCE = 0.2  # of the variance by weights alone
 _SHARES = np.exp(np.linspace(-3.0, 6.0, 28))  # of structure in a window, of that at the places around it
 
 
@@ -157,6 +159,8 @@ class _Solution:
     local_px: Float  # (n, 2), centres in the windows
     radius_px: Float
     estimator: Float  # (n, 2, pixels), what makes centres of values
+    plain: Float  # (n, 2, pixels), the same by weights alone
+    apart: Float  # (n, 2), what that makes of the centres, from here
     shade: Float  # (n, 1, pixels), what the ball leaves of structure in the background
     weight: Float  # (n, pixels)
     inverse: Float  # (n, 10 + k, 10 + k), of the normal matrices
@@ -250,24 +254,39 @@ def _solve(windows: _Windows, known: Modes, structure: Float, common: _Common) -
         inverse = invert(normal)
         change = np.matmul(inverse, right[:, :, None])[:, :, 0]
         scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(change[:, :3]).max(axis=1), 1e-12))
-        local = local + scale[:, None] * change[:, :2]
+        local, before = local + scale[:, None] * change[:, :2], radius
         radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
         residual = left - np.matmul(change[:, None], images)[:, 0]
     estimator = np.matmul(inverse[:, :2], seen).reshape(len(depth), 2, side, side)
     estimator = whiten(estimator, noise).reshape(len(depth), 2, -1) * root
-    return _Solution(local, radius, estimator, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure)
+    plain, apart = estimator, np.zeros((len(depth), 2))
+    if not noise.is_white:  # by weights alone, the surfaces held in the same proportion
+        precision[:, _PER_BALL:] *= known.noise
+        precision[:, 2] *= noise.gain(np.hypot(sigma_px, 0.5 * fits.radius_px))
+        weighted = images * root
+        normal = np.matmul(weighted, weighted.swapaxes(1, 2))
+        normal[:, each, each] += precision
+        right = np.matmul(weighted, (left * root[:, 0])[:, :, None])[:, :, 0]
+        right[:, 2] += precision[:, 2] * (target - before)
+        by_weights = invert(normal)
+        plain = np.matmul(by_weights[:, :2], weighted) * root
+        apart = np.matmul(by_weights[:, :2], right[:, :, None])[:, :, 0] - change[:, :2]
+    return _Solution(
+        local, radius, estimator, plain, apart, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure
+    )
 
 
 def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) -> BallFits:
     """Put centres, their covariances and what is left into a table."""
     fits, side, estimator = windows.fits, 2 * windows.half + 1, found.estimator
-    by_noise = (estimator / np.sqrt(np.where(found.weight > 0, found.weight, 1.0))[:, None]).reshape(-1, 2, side, side)
     at_ease = common.noise.variance_at(fits.background)[:, None]
     every = np.ones((len(at_ease), 1))
     covariance = fits.covariance.copy()
+    of_noise, of_plain = (_of_noise(e, found.weight, side, common) for e in (estimator, found.plain))
     covariance[:, :2, :2] = (
-        common.under * influence_covariance(by_noise, common.noise.correlation)
+        of_noise
+        + _surprise(found.apart, of_noise, of_plain)
         + _by((estimator * found.shade) @ known.surface, at_ease * _variance(known, found.structure))
         # what holding the radius at the usual one does where it is not, and what a wrong proportion does
         + _by(found.inverse[:, :2, 2:3] * found.held[:, None, None], every * common.size.radius_sd_px**2)
@@ -281,6 +300,24 @@ def _fits(windows: _Windows, found: _Solution, known: Modes, common: _Common) ->
     left = np.minimum(left, fits.chi2_core)  # a fit that is the best in correlated noise leaves more of slow changes
     position = found.local_px + windows.corner_px
     return replace(fits, position_px=position, covariance=covariance, chi2_core=left, chi2_uneven=under, chi2_ring=ring)
+
+
+def _of_noise(estimator: Float, weight: Float, side: int, common: _Common) -> Float:
+    """Covariance of what an estimator makes of noise."""
+    by_noise = (estimator / np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]).reshape(-1, 2, side, side)
+    return np.asarray(common.under * influence_covariance(by_noise, common.noise.correlation))
+
+
+def _surprise(apart: Float, efficient: Float, plain: Float) -> Float:
+    """Square of what two estimators differ by, as far as noise does not explain it (Hausman, Econometrica 46, 1978); shape (n, 2, 2).
+
+    Were all as described, the variance of the difference is the difference of the variances. If it is not, neither is known to be better.
+    """
+    size, of_plain = (np.maximum(np.trace(c, axis1=1, axis2=2), _TINY) for c in (efficient, plain))
+    chance = np.maximum(1 - size / of_plain, _LEAST_CHANCE)[:, None, None] * plain + _TINY * np.eye(2)
+    square = np.einsum("ni,ni->n", apart, np.linalg.solve(chance, apart[:, :, None])[:, :, 0])
+    part = np.maximum(1 - _USUAL / np.maximum(square, _TINY), 0.0)
+    return np.asarray(part[:, None, None] * apart[:, :, None] * apart[:, None])
 
 
 def _precision(known: Modes, structure: Float, fits: BallFits, noise: NoiseModel) -> Float:

@@ -19,7 +19,7 @@ from rsa_vision.types import Float
 _REACH = 4  # pixels; a longer filter does no better
 _NOTHING = 3e-3  # of the filter's middle, from which a tap counts
 _PERIOD = 64
-_LEAST_POWER = 0.1  # of white noise of the same variance: no frequency is known to have less, and blur is not known so well
+_LEAST_POWER = 0.3  # of white noise of the same variance: no frequency is known to have less, nor a mark to be so like its model
 
 
 def whiten(images: Float, noise: NoiseModel) -> Float:
