@@ -267,7 +267,7 @@ def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) 
 
 
 def uneven_white(residual: Float, weight: Float, local: Float, size: int, core: Bool, noise: NoiseModel) -> Float:
-    """Return the same of residuals whose noise is made white first: by what errors of centres come of."""
+    """Return the same of residuals whose noise is made white first, as fits of centres weigh them."""
     white = whiten((residual * np.sqrt(weight)).reshape(-1, size, size), noise).reshape(residual.shape)
     return uneven(white, (weight > 0).astype(np.float64), local, size, core)
 

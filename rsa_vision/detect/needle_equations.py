@@ -21,8 +21,8 @@ OF_SLANTS = {
     1: np.eye(2),
     3: np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0, 0, -1]]),
 }
-_OF_PRODUCT = 0.1  # how far off it is
-_CORE = 0.3  # of the largest depth, from which a pixel is under a needle
+_OF_PRODUCT = 0.1  # of the depth: error of the product of two shadows where they lie over each other
+_CORE = 0.3  # of the largest depth, from which the noise is that under a needle
 _RIDGE = 1e-4  # relative: keeps what the pixels do not determine where it is
 
 
@@ -83,7 +83,7 @@ class Equations:
         own, common, residual = white[: len(self.own)], white[len(self.own) : -1], white[-1]
         return replace(self, own=own, common=common, residual=residual, normal=white[:-1] @ white[:-1].T)
 
-    def under(self, own: Float, common: Float) -> float:
+    def noise_under(self, own: Float, common: Float) -> float:
         """Mean square of what is left under the needles once these changes are made over that beside them, each over what a fit leaves."""
         square = np.square(self.residual - own @ self.own - common @ self.common)
         leverage = np.einsum("pn,pn->n", self.own, self.inverse @ self.own)

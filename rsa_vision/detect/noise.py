@@ -280,11 +280,16 @@ def influence_covariance(influence: Float, correlation: Float) -> Float:
     return np.asarray(np.matmul(weighted, spectrum.conj().swapaxes(-1, -2)).real, np.float64)
 
 
+def power_spectrum(correlation: Float, size: int) -> Float:
+    """Return the power of correlated noise of variance one at the frequencies of ``rfft2`` of ``size`` pixels a side."""
+    wrapped, side = np.zeros((size, size)), len(correlation)
+    wrapped[:side, :side] = correlation
+    return np.asarray(np.fft.rfft2(np.roll(wrapped, (-(side // 2), -(side // 2)), (0, 1))).real)
+
+
 @lru_cache(maxsize=64)
 def _power(correlation: bytes, side: int, size: int) -> Float:
     """Return the power of correlated noise at the frequencies of ``rfft2``, for sums over the half spectrum to be sums over pixels."""
-    kernel = np.zeros((size, size))
-    kernel[:side, :side] = np.frombuffer(correlation).reshape(side, side)
-    power = np.maximum(np.fft.rfft2(np.roll(kernel, (-(side // 2), -(side // 2)), (0, 1))).real, 0.0) / size**2
+    power = np.maximum(power_spectrum(np.frombuffer(correlation).reshape(side, side), size), 0.0) / size**2
     power[:, 1 : (size + 1) // 2] *= 2
     return np.asarray(power.ravel(), np.float32)

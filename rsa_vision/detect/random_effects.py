@@ -149,7 +149,7 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
 
 
 def _precision(known: Modes, structure: Float, fits: BallFits, noise: NoiseModel) -> Float:
-    variance = known.noise * np.maximum(structure[:, known.degree], _NONE)
+    variance = variance_of(known, np.maximum(structure, _NONE))
     return np.asarray(1 / (variance * noise.variance_at(fits.background)[:, None]))
 
 

@@ -214,9 +214,8 @@ def _held_over(values: NDArray[Any], near: Int, estimator: Float, known: Modes, 
     side = round(np.sqrt(values.shape[1]))
     mean = values.mean(axis=1)
     stated = influence_covariance(estimator.reshape(-1, 2, side, side), noise.correlation)
-    stated = (
-        stated + _by(estimator @ known.surface, variance_of(known, structure)) + _TINY * np.eye(2)
-    )  # a ball may lie wholly under others
+    stated = stated + _by(estimator @ known.surface, variance_of(known, structure))
+    stated = stated + _TINY * np.eye(2)  # a ball may lie wholly under others
     error = np.einsum("kip,kp->ki", estimator[near], values - mean[:, None])
     square = np.einsum("ki,ki->k", error, np.linalg.solve(stated[near], error[:, :, None])[:, :, 0])
     return np.asarray(square / noise.variance_at(mean) / _OF_CHANCE)

@@ -118,7 +118,7 @@ def fit_shared(
     normal = precision + sum(matrix for matrix, _ in told)
     change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
     moves = [e.step(change) for e in systems]
-    left = np.array([e.under(own, change) for e, own in zip(systems, moves, strict=True)])
+    left = np.array([e.noise_under(own, change) for e, own in zip(systems, moves, strict=True)])
     # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
     under = at_rims(min(usual_square(left), 1.0)) if len(needles) >= LEAST else 1.0
     errors = _common_errors(windows, systems, normal, precision, noise, under)
@@ -192,13 +192,15 @@ def _common_errors(
     spread = precision.copy()
     for window, e in zip(windows, systems, strict=True):
         unexplained = e.common - e.own_by_common.T @ e.own
-        spread += (
-            under * influence_covariance(window.square(window.whiten(unexplained, noise)), noise.correlation)
-            + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)
-        ) / e.excess
+        spread += (under * _of_noise(window, unexplained, noise) + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)) / e.excess
     inverse = np.linalg.inv(normal)
     covariance: Float = inverse @ spread @ inverse
     return covariance
+
+
+def _of_noise(window: Window, white: Float, noise: NoiseModel) -> Float:
+    """Covariance that the film's noise makes of linear functions (p, n) of what is white."""
+    return influence_covariance(window.square(window.whiten(white, noise)), noise.correlation)
 
 
 def _finished(
@@ -206,8 +208,7 @@ def _finished(
 ) -> list[NeedleFit]:
     to_tips = e.inverse[e.tips] @ e.own
     by_common = e.own_by_common[e.tips]
-    covariance = under * influence_covariance(window.square(window.whiten(to_tips, noise)), noise.correlation)
-    covariance = covariance + by_common @ errors @ by_common.T
+    covariance = under * _of_noise(window, to_tips, noise) + by_common @ errors @ by_common.T
     of_prior = e.inverse[e.tips] * e.prior  # what is held near to the expected is not exactly there
     covariance = covariance + of_prior @ of_prior.T
     variance = float(noise.variance_at(np.array([e.background]))[0])

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.noise import NoiseModel, power_spectrum
 from rsa_vision.types import Float
 
 _REACH = 4  # pixels; a longer filter does no better
@@ -48,10 +48,8 @@ def whiten(images: Float, noise: NoiseModel) -> Float:
 
 @lru_cache(maxsize=64)
 def _kernel(correlation: bytes, side: int) -> NDArray[np.float64]:
-    wrapped = np.zeros((_PERIOD, _PERIOD))
-    wrapped[:side, :side] = np.frombuffer(correlation).reshape(side, side)
-    power = np.fft.rfft2(np.roll(wrapped, (-(side // 2), -(side // 2)), (0, 1))).real
+    power = power_spectrum(np.frombuffer(correlation).reshape(side, side), _PERIOD)
     power += max(0.0, _LEAST_POWER - power.min())
-    kernel = np.fft.irfft2(1 / np.sqrt(power), s=wrapped.shape)
+    kernel = np.fft.irfft2(1 / np.sqrt(power), s=(_PERIOD, _PERIOD))
     reach = int(np.flatnonzero(np.abs(kernel[0, : _REACH + 1]) > _NOTHING * kernel[0, 0]).max())
     return np.asarray(np.roll(kernel, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1].copy())
