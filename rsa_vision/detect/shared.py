@@ -21,7 +21,7 @@ from rsa_vision.detect.needle_equations import OF_SLANTS, OPTICS, SHARED, SLANT,
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_sets import clusters, others_beside
 from rsa_vision.detect.needles import between, scored
-from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
@@ -200,7 +200,7 @@ def _common_errors(
 
 def _of_noise(window: Window, white: Float, noise: NoiseModel) -> Float:
     """Covariance that the film's noise makes of linear functions (p, n) of what is white."""
-    return influence_covariance(window.square(window.whiten(white, noise)), noise.correlation)
+    return window.covariance(window.whiten(white, noise), noise)
 
 
 def _finished(
