@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from rsa_vision.detect.ball_equations import polynomial
 from rsa_vision.detect.needle_images import Images, NeedleFit, NeedleShape, arm_images, needle_image, support
 from rsa_vision.detect.needles import PROMISING, between, explains, scored, step_of
-from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.whitening import whiten
-from rsa_vision.types import Float
+from rsa_vision.types import Float, Int
 
 _STEPS, _QUICK_STEPS = 16, 5
 _CONVERGED_PX = 0.02  # a step's change: what is left after it is a tenth of that, and the last fit follows
@@ -35,10 +35,12 @@ class Window:
         Places on the film; its values, the images of neighbours taken away; those images.
     surface : ndarray of shape (6, n)
         Parts of a quadratic background.
-    corner_px : ndarray of shape (2,)
-        (col, row) of the first pixel of the square around them.
-    size : int
-        Its side.
+    half : int
+        Half the side of the square around them.
+    place : ndarray of int, shape (n,)
+        Where they lie in the smallest box around them.
+    box : tuple of int
+        Its rows and columns.
     """
 
     cols: Float
@@ -46,22 +48,22 @@ class Window:
     data: Float
     beside: Float
     surface: Float
-    corner_px: Float
-    size: int
-
-    def square(self, values: Float) -> Float:
-        """Put values at the pixels, shape (p, n), into the square, shape (p, size, size)."""
-        out = np.zeros((len(values), self.size, self.size))
-        at = (self.rows - self.corner_px[1]).astype(np.intp), (self.cols - self.corner_px[0]).astype(np.intp)
-        out[:, *at] = values
-        return out
+    half: int
+    place: Int
+    box: tuple[int, int]
 
     def whiten(self, values: Float, noise: NoiseModel) -> Float:
         """Filter values at the pixels, in units of the noise, shape (p, n), so that the noise in them is white."""
-        at = (self.rows - self.rows.min()).astype(np.intp), (self.cols - self.cols.min()).astype(np.intp)
-        box = np.zeros((len(values), *(int(axis.max()) + 1 for axis in at)))
-        box[:, *at] = values
-        return np.asarray(whiten(box, noise)[:, *at])
+        return np.asarray(whiten(self._boxes(values), noise).reshape(len(values), -1)[:, self.place], np.float64)
+
+    def covariance(self, influence: Float, noise: NoiseModel) -> Float:
+        """Return the covariance of linear functions (p, n) of the film's noise at the pixels."""
+        return influence_covariance(self._boxes(influence), noise.correlation)
+
+    def _boxes(self, values: Float) -> NDArray[np.float32]:
+        out = np.zeros((len(values), self.box[0] * self.box[1]), np.float32)  # no needle's table is finer than that
+        out[:, self.place] = values
+        return out.reshape(len(values), *self.box)
 
 
 def window_of(
@@ -84,9 +86,11 @@ def window_of(
         near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + _AROUND_PX)
     rows, cols = np.nonzero(near & patch.valid[0])
     raw = patch.values[0][rows, cols]
+    first, box = int(cols.min(initial=patch.size)), (int(np.ptp(rows)) + 1, int(np.ptp(cols)) + 1)
+    place = (rows - rows[0]) * box[1] + cols - first
     cols, rows = cols + corner[0], rows + corner[1]
     beside = np.zeros_like(raw) if others is None else others(cols, rows)
-    return Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]).T, corner, patch.size)
+    return Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]).T, half, place, box)
 
 
 def chi2_of(window: Window, fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
@@ -132,7 +136,7 @@ def fit_crossing(
     now = list(needles)
     window = window_of(film, now, optics, noise, others)
     steps = min(steps, _QUICK_STEPS) if quick else steps
-    cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.size // 2
+    cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.half
     weight = 1.0 / noise.variance_at(data + window.beside)
     converged = False
     ground = np.zeros(len(data))  # background above its mean under each pixel

@@ -164,13 +164,12 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
 
 def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:
     """Of fits that fell on the same place keep the better one (best first)."""
-    order = np.argsort(misfit(fits, noise) + (1 - fits.explained))
-    keep: list[int] = []
+    dx, dy = (at[:, None] - at for at in fits.position_px.T)
+    near = dx * dx + dy * dy < (0.5 * fits.radius_px[:, None]) ** 2
+    order, kept = np.argsort(misfit(fits, noise) + (1 - fits.explained)), np.zeros(len(near), bool)
     for i in order:
-        gap = np.hypot(*(fits.position_px[keep] - fits.position_px[i]).T) if keep else np.zeros(0)
-        if not (gap < 0.5 * fits.radius_px[i]).any():
-            keep.append(int(i))
-    return fits.rows(np.array(keep, dtype=np.intp))
+        kept[i] = not (near[i] & kept).any()
+    return fits.rows(order[kept[order]])
 
 
 def refine(grid: tuple[float, ...], costs: list[float]) -> float:

@@ -13,10 +13,11 @@ from rsa_vision.detect.crossing import fit_crossing
 from rsa_vision.detect.needle_images import Images, NeedleFit, needle_image
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Float
+from rsa_vision.types import Bool, Float
 
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
 MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
+_BESIDE_PX = 10.0  # from the ends of arms, a little longer than they are, within which others are beside them
 
 
 def fit_all(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel, *, again: int = 0) -> list[NeedleFit]:
@@ -25,9 +26,8 @@ def fit_all(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise:
     ``again``: sets of up to so many were fitted in the same way before, so that what has come to rest and has no neighbours stays as it is.
     """
     out: list[NeedleFit] = []
-    for members in clusters(needles):
-        rest = [t for t in needles if all(t is not m for m in members)]
-        others = others_beside(members, rest, optics)
+    sets = clusters(needles)
+    for members, others in zip(sets, beside_each(sets, optics), strict=True):
         at_rest = len(members) <= again and others is None and all(m.converged for m in members)
         out += members if at_rest else fit_crossing(film, members, optics, noise, others=others)
     return out
@@ -48,12 +48,31 @@ def clusters(needles: list[NeedleFit]) -> list[list[NeedleFit]]:
         reach = reach * 0.85
 
 
+def beside_each(sets: list[list[NeedleFit]], optics: Optics) -> list[Images | None]:
+    """Return, for each set of the needles of a film, the images of those beside its members, as of :func:`others_beside`."""
+    needles, sizes = [t for members in sets for t in members], [len(members) for members in sets]
+    belongs = np.repeat(np.arange(len(sets)), sizes)
+    near = _reaches(needles, needles) & (belongs[:, None] != belongs)
+    parts = [near[end - size : end].any(axis=0) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
+    return [_images([needles[i] for i in np.flatnonzero(part)], optics) for part in parts]
+
+
 def others_beside(members: NeedleFit | list[NeedleFit], rest: list[NeedleFit], optics: Optics) -> Images | None:
     """Return the images of those beside the members, for the fits to subtract; None where there are none."""
-    mine = members if isinstance(members, list) else [members]
-    place, length = np.array([t.position_px for t in rest]).reshape(-1, 2), np.array([t.shape.length_px for t in rest])
-    gaps = np.min([np.hypot(*(place - m.position_px).T) - 1.3 * (length + m.shape.length_px) for m in mine], axis=0)
-    near = [rest[i] for i in np.flatnonzero(gaps < 10)]
+    near = _reaches(members if isinstance(members, list) else [members], rest).any(axis=0)
+    return _images([rest[i] for i in np.flatnonzero(near)], optics)
+
+
+def _reaches(some: list[NeedleFit], others: list[NeedleFit]) -> Bool:
+    """Say which of others may be seen among the pixels of some needles, shape (some, others)."""
+    (x, y, length), (at_x, at_y, reach) = (
+        np.array([(*t.position_px, t.shape.length_px) for t in these]).reshape(-1, 3).T for these in (some, others)
+    )
+    gap = np.hypot(x[:, None] - at_x, y[:, None] - at_y) - 1.3 * (length[:, None] + reach)
+    return np.asarray(gap < _BESIDE_PX)
+
+
+def _images(near: list[NeedleFit], optics: Optics) -> Images | None:
     if not near:
         return None
 

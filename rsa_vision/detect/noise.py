@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.special import chdtri
 
 from rsa_vision.types import Float
@@ -220,8 +220,8 @@ def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
         return _lag_zero(), 0.0
     tiles = (rest / np.sqrt(np.maximum(variance, 1e-12))[:, None]).reshape(-1, side, side)
     size = 2 * side
-    spectrum = np.abs(np.fft.rfft2(tiles, s=(size, size))) ** 2
-    sums = np.fft.irfft2(spectrum.mean(0), s=(size, size))
+    spectrum = np.abs(rfft2(tiles, s=(size, size))) ** 2
+    sums = irfft2(spectrum.mean(0), s=(size, size))
     lag = np.arange(-LAGS, LAGS + 1)
     pairs = (side - np.abs(lag))[:, None] * (side - np.abs(lag))[None, :]
     auto = sums[np.ix_(lag % size, lag % size)] / pairs
@@ -256,7 +256,7 @@ def _smooth_correlation(auto: Float) -> tuple[Float, float]:
     return correlation, beta
 
 
-def influence_covariance(influence: Float, correlation: Float) -> Float:
+def influence_covariance(influence: NDArray[Any], correlation: Float) -> Float:
     """Return the covariance of linear functions of correlated noise.
 
     A weighted least-squares fit stays unbiased when the noise of neighbouring pixels is correlated, but its variance is no longer the
@@ -264,7 +264,7 @@ def influence_covariance(influence: Float, correlation: Float) -> Float:
 
     Parameters
     ----------
-    influence : ndarray of shape (..., p, s, s)
+    influence : ndarray of shape (..., p, rows, cols)
         What one standard deviation of noise in each pixel does to each of ``p`` parameters; 0 outside the fit.
     correlation : ndarray of shape (2 LAGS + 1, 2 LAGS + 1)
 
@@ -273,23 +273,23 @@ def influence_covariance(influence: Float, correlation: Float) -> Float:
     ndarray of shape (..., p, p)
     """
     # by Parseval's theorem in the frequency domain, where the columns of the half spectrum but the first and the middle one stand for two
-    size = next_fast_len(influence.shape[-1] + correlation.shape[0], real=True)
+    size = tuple(next_fast_len(n + len(correlation), real=True) for n in influence.shape[-2:])
     # to six digits, in half the time of double precision
-    spectrum = np.fft.rfft2(influence.astype(np.float32), s=(size, size)).reshape(*influence.shape[:-2], -1)
+    spectrum = rfft2(influence.astype(np.float32), s=size).reshape(*influence.shape[:-2], -1)
     weighted = spectrum * _power(correlation.tobytes(), len(correlation), size)
     return np.asarray(np.matmul(weighted, spectrum.conj().swapaxes(-1, -2)).real, np.float64)
 
 
-def power_spectrum(correlation: Float, size: int) -> Float:
-    """Return the power of correlated noise of variance one at the frequencies of ``rfft2`` of ``size`` pixels a side."""
-    wrapped, side = np.zeros((size, size)), len(correlation)
+def power_spectrum(correlation: Float, size: tuple[int, ...]) -> Float:
+    """Return the power of correlated noise of variance one at the frequencies of ``rfft2`` of so many rows and columns."""
+    wrapped, side = np.zeros(size), len(correlation)
     wrapped[:side, :side] = correlation
-    return np.asarray(np.fft.rfft2(np.roll(wrapped, (-(side // 2), -(side // 2)), (0, 1))).real)
+    return np.asarray(rfft2(np.roll(wrapped, (-(side // 2), -(side // 2)), (0, 1))).real)
 
 
 @lru_cache(maxsize=64)
-def _power(correlation: bytes, side: int, size: int) -> Float:
+def _power(correlation: bytes, side: int, size: tuple[int, ...]) -> Float:
     """Return the power of correlated noise at the frequencies of ``rfft2``, for sums over the half spectrum to be sums over pixels."""
-    power = np.maximum(power_spectrum(np.frombuffer(correlation).reshape(side, side), size), 0.0) / size**2
-    power[:, 1 : (size + 1) // 2] *= 2
+    power = np.maximum(power_spectrum(np.frombuffer(correlation).reshape(side, side), size), 0.0) / np.prod(size)
+    power[:, 1 : (size[1] + 1) // 2] *= 2
     return np.asarray(power.ravel(), np.float32)

@@ -39,13 +39,24 @@ class Painted:
         if cols.size == 0:
             return total
         side = self.images.shape[1]
-        place = np.rint([cols, rows]).astype(np.intp)
-        low, high = (limit(place.reshape(2, -1), axis=1) for limit in (np.min, np.max))
-        for k in np.flatnonzero(((self.corner_px <= high) & (self.corner_px + side > low)).all(1)):
+        low, high = (np.rint([limit(cols), limit(rows)]) for limit in (np.min, np.max))
+        near = np.flatnonzero(((self.corner_px <= high) & (self.corner_px + side > low)).all(1))
+        place = [np.rint(at).astype(np.intp) for at in (cols, rows)] if len(near) else []
+        for k in near:
             col, row = (at - first for at, first in zip(place, self.corner_px[k], strict=True))
             inside = (col >= 0) & (col < side) & (row >= 0) & (row < side)
             total[inside] += self.images[k, row[inside], col[inside]]
         return total
+
+    def taken_from(self, box: NDArray[Any], left: int, top: int) -> NDArray[np.float32]:
+        """Return a box of the film, whose first pixel is at this column and row, without the images."""
+        out = box.astype(np.float32)
+        side, size = self.images.shape[1], np.array(box.shape[::-1])
+        low = self.corner_px - [left, top]
+        for k in np.flatnonzero(((low < size) & (low + side > 0)).all(1)):
+            (c0, r0), (c1, r1) = np.maximum(low[k], 0), np.minimum(low[k] + side, size)
+            out[r0:r1, c0:c1] -= self.images[k, r0 - low[k, 1] : r1 - low[k, 1], c0 - low[k, 0] : c1 - low[k, 0]]
+        return out
 
     def explain(self, film: NDArray[Any], position_px: Float, radius_px: Float) -> Bool:
         """Say at which places (n, 2) the needles make nearly all by which a disc differs from a ring around it, shape (n,)."""

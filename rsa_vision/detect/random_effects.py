@@ -112,7 +112,12 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
             images = np.concatenate([np.stack(moves, axis=1), curves], axis=1)
             weight = windows.valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
             root = np.sqrt(weight)[:, None]
-            seen = whiten((images * root).reshape(*images.shape[:2], side, side), noise).reshape(images.shape)
+            # filtered in single precision, added up in double
+            seen = (
+                whiten((images * root).astype(np.float32).reshape(*images.shape[:2], side, side), noise)
+                .reshape(images.shape)
+                .astype(np.float64)
+            )
             products = np.matmul(seen, seen.swapaxes(1, 2))
         white = whiten((left[:, None] * root).reshape(-1, side, side), noise).reshape(len(depth), -1, 1)
         normal, right = products.copy(), np.matmul(seen, white)[:, :, 0]

@@ -19,9 +19,9 @@ from rsa_vision.detect.crossing import Window, window_of
 from rsa_vision.detect.leftover import LEAST, at_rims, usual_square
 from rsa_vision.detect.needle_equations import OF_SLANTS, OPTICS, SHARED, SLANT, Equations, by_optics, linearise
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
-from rsa_vision.detect.needle_sets import clusters, others_beside
+from rsa_vision.detect.needle_sets import beside_each, clusters
 from rsa_vision.detect.needles import between, scored
-from rsa_vision.detect.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
@@ -76,7 +76,7 @@ def fit_shared(
         return [], optics
     parallel = parallel and len(needles[0].angles) > 1
     sets = clusters(needles)
-    windows = [_window(film, members, needles, optics, noise) for members in sets]
+    windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
     before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, _SIZE_ERROR, _SIZE_ERROR]
     precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     moved = np.zeros(len(precision))
@@ -126,11 +126,6 @@ def fit_shared(
     for window, e, own in zip(windows, systems, moves, strict=True):
         out += _finished(window, e, own[e.tips].reshape(-1, 2), errors, optics, noise, under, converged)
     return out, optics
-
-
-def _window(film: NDArray[Any], members: list[NeedleFit], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> Window:
-    others = others_beside(members, [t for t in needles if all(t is not m for m in members)], optics)
-    return window_of(film, members, optics, noise, others)
 
 
 def _step(normal: Float, target: Float, taper: float) -> Float:
@@ -200,7 +195,7 @@ def _common_errors(
 
 def _of_noise(window: Window, white: Float, noise: NoiseModel) -> Float:
     """Covariance that the film's noise makes of linear functions (p, n) of what is white."""
-    return influence_covariance(window.square(window.whiten(white, noise)), noise.correlation)
+    return window.covariance(window.whiten(white, noise), noise)
 
 
 def _finished(

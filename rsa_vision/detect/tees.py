@@ -181,8 +181,7 @@ def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optic
         half = int(2.5 * tee.shape.length_px)
         left, top = (max(int(x) - half, 0) // SCALE * SCALE for x in tee.position_px)
         box = film[top : top + 2 * half, left : left + 2 * half]
-        rows, cols = np.mgrid[top : top + box.shape[0], left : left + box.shape[1]]
-        for col, row, likeness in find_like(box - painted(cols, rows), seen):
+        for col, row, likeness in find_like(painted.taken_from(box, left, top), seen):
             place = np.array([col + left, row + top])
             if min(math.dist(t.position_px, place) for t in tees) > _NEAREST_PX:
                 starts.append((likeness, replace(model, position_px=place)))

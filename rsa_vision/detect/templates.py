@@ -22,7 +22,7 @@ from rsa_vision.types import Bool, Float
 
 LIKENESS = 0.4  # correlation coefficient from which a place is worth a fit; two tees one over the other reach 0.5 to 0.7
 SCALE = 2  # the film is searched at half resolution
-_BAND = 128  # rows of that, which stay in the cache
+_BAND = 256  # rows of that, which stay in the cache
 _APART = 2  # pixels of that, between peaks
 _SPARSE = 16  # every so-manieth pixel tells the mean of a film
 _LEAST_VARIANCE = 0.02  # of rounded values, means of four
@@ -73,8 +73,9 @@ def _correlation(image: NDArray[np.float32], template: NDArray[np.float32]) -> N
     image = image - image[::_SPARSE, ::_SPARSE].mean()
     product = cv2.matchTemplate(image, bare, cv2.TM_CCORR)
     inside = slice(side // 2, -(side // 2))
-    mean, square = (np.asarray(m(image, cv2.CV_64F, (side, side))[inside, inside], np.float64) for m in (cv2.boxFilter, cv2.sqrBoxFilter))
-    spread = np.sqrt(np.maximum((square - mean * mean).astype(np.float32), np.float32(_LEAST_VARIANCE)))
+    mean, square = (m(image, cv2.CV_64F, (side, side)) for m in (cv2.boxFilter, cv2.sqrBoxFilter))
+    variance = cv2.subtract(square, cv2.multiply(mean, mean, dst=mean), dtype=cv2.CV_32F)[inside, inside]
+    spread = np.sqrt(np.maximum(variance, np.float32(_LEAST_VARIANCE)))
     return np.asarray(cv2.divide(product, spread, dst=product, scale=1 / (side * float(np.linalg.norm(bare)))))
 
 
