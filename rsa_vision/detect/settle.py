@@ -96,7 +96,7 @@ def settle(
         proportion(balls.depth[told], balls.background[told], level[told]),
         around.differ,
     )
-    usual = np.median(balls.chi2_uneven[free]) if free.any() else 1.0  # what all balls leave is no speck on one
+    usual = float(np.median(balls.chi2_uneven[free])) if free.any() else 1.0  # what all balls leave is no speck on one
     out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
@@ -104,8 +104,8 @@ def settle(
             part = these.balls[begin : begin + _BATCH]
             windows = _without_others(_windows(film, balls, part, these.half, beside, noise), edged[part], common)
             solution = solve(windows, known, structure[part], common)
-            around = np.maximum(common.under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
-            specks = find_specks(solution, solution.radius_px + optics.sigma_px, windows.fits.depth, around, 2 * these.half + 1, noise)
+            excess = np.maximum(under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
+            specks = find_specks(solution, solution.radius_px + optics.sigma_px, windows.fits.depth, excess, 2 * these.half + 1, noise)
             fits = _fits(windows, solution, specks, known, common)
             left = fits.chi2_uneven - balls.chi2_uneven[part] > CHANCE * noise.scatter(fits.n_core)
             covered[part] = windows.covered

@@ -24,7 +24,10 @@ _BEYOND_PX: Final = 1.0  # the rim
 _SURE: Final = 4.5  # standard deviations that none of a film's places reaches by chance
 _SHARE: Final = 0.5  # of the significance there is before anything else is fitted anew
 _LEAST: Final = 1 / 3  # of a speck, that the fit does not take for something else: with less nothing is known of it
-_MOST: Final = 0.5  # of the ball's depth, and as much less opposite: what is higher than the ball is no speck on it
+_HEIGHT: Final = (
+    0.03,
+    0.5,
+)  # of the ball's depth, and as much less opposite: models of balls are no truer, and specks no higher than balls
 _NOTHING: Final = 1e-30
 
 
@@ -89,17 +92,19 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
             both = 2 * np.sqrt(alone[i, place] * alone[i, across]) * np.exp(-apart / (4 * spread_px**2))
             both = alone[i, place] + alone[i, across] - both
             own = np.maximum(both - (taken * fitted).sum(axis=0), _NOTHING)
-            told_apart = (own > _LEAST * both) & (np.abs(odd[i, place]) < _MOST * abs(depth[i]) * own)
-            score = np.where(told_apart, np.abs(odd[i, place]) / np.sqrt(own), 0.0)
+            height = odd[i, place] / own
+            of_ball = np.abs(height / depth[i])
+            possible = (own > _LEAST * both) & (of_ball > _HEIGHT[0]) & (of_ball < _HEIGHT[1])
+            score = np.where(possible, np.abs(height) * np.sqrt(own), 0.0)
             k = int(score.argmax())
             if score[k] < best[i]:
                 continue
-            best[i], height = score[k], odd[i, place[k]] / own[k]
+            best[i] = score[k]
             spots = np.zeros((1, pixels))
-            spots[0, place[k]], spots[0, across[k]] = height, -height
-            out.shift_px[i] = -height * fitted[:2, k]
+            spots[0, place[k]], spots[0, across[k]] = 1.0, -1.0
+            out.shift_px[i] = -height[k] * fitted[:2, k]
             out.covariance[i] = excess[i] / own[k] * np.outer(fitted[:2, k], fitted[:2, k])
-            out.image[i] = _at_every_place(spots, side, spread_px)[0] - height * fitted[:, k] @ solution.images[i]
+            out.image[i] = height[k] * (_at_every_place(spots, side, spread_px)[0] - fitted[:, k] @ solution.images[i])
     return out
 
 
@@ -110,7 +115,8 @@ def _white(images: Float, side: int, noise: NoiseModel) -> Float:
 def _at_every_place(images: Float, side: int, spread_px: float) -> Float:
     """Return the products of images (n, pixels) with a speck at every place."""
     stack = np.ascontiguousarray(images.reshape(-1, side, side).transpose(1, 2, 0))
-    out = cv2.sepFilter2D(stack, cv2.CV_64F, *[_profile(spread_px)] * 2, borderType=cv2.BORDER_CONSTANT)
+    profile = _profile(spread_px)
+    out = cv2.sepFilter2D(stack, cv2.CV_64F, profile, profile, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(out.reshape(side, side, -1).transpose(2, 0, 1).reshape(images.shape))
 
 

@@ -12,7 +12,7 @@ from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored
 
-BAND = (0.8, 1.15)  # observed / stated error of 200 to 400 coordinates
+BAND = (0.85, 1.15)  # observed / stated error of 200 to 600 coordinates
 SIDE = 940
 STRUCTURE = 1000.0  # standard deviation, of balls 12000 deep
 
@@ -33,10 +33,13 @@ def _field(grain_px: float, rng: np.random.Generator) -> Float:
 
 @pytest.mark.parametrize("grain_px", [6.0, 10.0])
 def test_structure_pulls_less_than_a_quadratic_background_lets_it(grain_px: float) -> None:
-    rng = np.random.default_rng(21)
-    truth, radius = grid_of_balls(rng, 10, 90.0, (4.5, 5.0))
-    clear = film_of_balls((SIDE, SIDE), truth, radius, depth=0.4, sigma_px=1.2, noise_sd=150.0, rng=rng)
-    error, sd = _errors(clear + STRUCTURE * _field(grain_px, rng), truth)
+    both = []
+    for seed in (20, 21, 23):  # of one film of 100 balls in such structure the ratio scatters by a tenth
+        rng = np.random.default_rng(seed)
+        truth, radius = grid_of_balls(rng, 10, 90.0, (4.5, 5.0))
+        clear = film_of_balls((SIDE, SIDE), truth, radius, depth=0.4, sigma_px=1.2, noise_sd=150.0, rng=rng)
+        both.append(_errors(clear + STRUCTURE * _field(grain_px, rng), truth))
+    error, sd = (np.concatenate(parts) for parts in zip(*both, strict=True))
     half = int(np.ceil(1.9 * 5.0 + 3 * 1.2 + 2))
     quadratic = []  # what the best fit on a quadratic background makes of the same structure, by first-order theory
     structure = STRUCTURE * _field(grain_px, np.random.default_rng(22))
