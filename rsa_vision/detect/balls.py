@@ -256,14 +256,19 @@ def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) 
     core : ndarray of bool, shape (n, size * size)
         Pixels under the ball.
     """
-    twice = np.rint(2 * local).astype(np.intp)
-    axis = np.arange(size)
-    cols, rows = np.clip(twice[:, :1] - axis, 0, size - 1), np.clip(twice[:, 1:] - axis, 0, size - 1)
-    opposite = (rows[:, :, None] * size + cols[:, None, :]).reshape(len(local), -1)
+    opposite = mirrored(local, size)
     pairs = core & (weight > 0) & (np.take_along_axis(weight, opposite, 1) > 0)
     odd = residual - np.take_along_axis(residual, opposite, 1)
     out: Float = (0.5 * pairs * weight * odd**2).sum(1) / np.maximum(pairs.sum(1) - 4, 1.0)
     return out
+
+
+def mirrored(local: Float, size: int) -> Int:
+    """Return the index of the pixel opposite to each about a centre, shape (n, size * size)."""
+    twice = np.rint(2 * local).astype(np.intp)
+    axis = np.arange(size)
+    cols, rows = np.clip(twice[:, :1] - axis, 0, size - 1), np.clip(twice[:, 1:] - axis, 0, size - 1)
+    return np.asarray((rows[:, :, None] * size + cols[:, None, :]).reshape(len(local), -1))
 
 
 def uneven_white(residual: Float, weight: Float, local: Float, size: int, core: Bool, noise: NoiseModel) -> Float:

@@ -69,6 +69,8 @@ class Solution:
     residual: Float  # (n, pixels)
     ground: Float  # (n, pixels), background over its value at the centre, times the ball's image
     structure: Float  # (n, degrees), of the windows themselves
+    images: Float  # (n, 10 + k, pixels), what was added up to them
+    white: Float  # (n, 10 + k, pixels), those in units of noise made white
 
 
 def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> Solution:
@@ -149,7 +151,20 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
         plain = np.matmul(by_weights, weighted) * root
         apart = np.matmul(by_weights, right[:, :, None])[:, :, 0] - change[:, :2]
     return Solution(
-        local, radius, estimator, plain, apart, shade, weight, inverse, held, residual, value * (theta[:, 1:] @ surface[1:]), structure
+        local,
+        radius,
+        estimator,
+        plain,
+        apart,
+        shade,
+        weight,
+        inverse,
+        held,
+        residual,
+        value * (theta[:, 1:] @ surface[1:]),
+        structure,
+        images,
+        seen,
     )
 
 

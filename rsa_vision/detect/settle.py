@@ -26,6 +26,7 @@ from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.random_effects import Common, Solution, Windows, hold, solve, variance_of
 from rsa_vision.detect.resolve import OF_SHIFT, Beside
+from rsa_vision.detect.specks import Specks, find_specks
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import proportion, usual_size
 from rsa_vision.types import Bool, Float, Int
@@ -95,6 +96,7 @@ def settle(
         proportion(balls.depth[told], balls.background[told], level[told]),
         around.differ,
     )
+    usual = float(np.median(balls.chi2_uneven[free])) if free.any() else 1.0  # what all balls leave is no speck on one
     out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
@@ -102,7 +104,9 @@ def settle(
             part = these.balls[begin : begin + _BATCH]
             windows = _without_others(_windows(film, balls, part, these.half, beside, noise), edged[part], common)
             solution = solve(windows, known, structure[part], common)
-            fits = _fits(windows, solution, known, common)
+            excess = np.maximum(under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
+            specks = find_specks(solution, solution.radius_px + optics.sigma_px, windows.fits.depth, excess, 2 * these.half + 1, noise)
+            fits = _fits(windows, solution, specks, known, common)
             left = fits.chi2_uneven - balls.chi2_uneven[part] > CHANCE * noise.scatter(fits.n_core)
             covered[part] = windows.covered
             crossed, apart = (windows.covered > 0) & (windows.covered <= MOST_COVERED), fits.position_px - balls.position_px[part]
@@ -166,7 +170,7 @@ def _without_others(windows: Windows, edged: Bool, common: Common) -> Windows:
     return replace(windows, valid=valid, covered=covered)
 
 
-def _fits(windows: Windows, found: Solution, known: Modes, common: Common) -> BallFits:
+def _fits(windows: Windows, found: Solution, specks: Specks, known: Modes, common: Common) -> BallFits:
     """Put centres, their covariances and what is left into a table."""
     fits, side, estimator = windows.fits, 2 * windows.half + 1, found.estimator
     at_ease = common.noise.variance_at(fits.background)[:, None]
@@ -180,14 +184,17 @@ def _fits(windows: Windows, found: Solution, known: Modes, common: Common) -> Ba
         # what holding the radius at the usual one does where it is not, and what a wrong proportion does
         + _by(found.inverse[:, :2, 2:3] * found.held[:, None, None], every * common.size.radius_sd_px**2)
         + _by(np.matmul(estimator, found.ground[:, :, None]), every * common.proportion.sd**2)
+        + specks.covariance
+        + OF_SHIFT * specks.shift_px[:, :, None] * specks.shift_px[:, None]
     )
     rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1)
-    distance = np.hypot(cols - found.local_px[:, :1], rows - found.local_px[:, 1:])
+    local, residual = found.local_px + specks.shift_px, found.residual - specks.image
+    distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
     core = distance < (found.radius_px + common.optics.sigma_px)[:, None]
-    under, ring = (uneven_white(found.residual, found.weight, found.local_px, side, where, common.noise) for where in (core, ~core))
-    left = (found.weight * found.residual**2 * core).sum(axis=1) / np.maximum((core & (found.weight > 0)).sum(axis=1), 1)
+    under, ring = (uneven_white(residual, found.weight, local, side, where, common.noise) for where in (core, ~core))
+    left = (found.weight * residual**2 * core).sum(axis=1) / np.maximum((core & (found.weight > 0)).sum(axis=1), 1)
     left = np.minimum(left, fits.chi2_core)  # a fit that is the best in correlated noise leaves more of slow changes
-    position = found.local_px + windows.corner_px
+    position = local + windows.corner_px
     return replace(fits, position_px=position, covariance=covariance, chi2_core=left, chi2_uneven=under, chi2_ring=ring)
 
 
