@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.special import ndtri
 
 from rsa_vision.detect.balls import BallFits, fit_balls, half_size, join
@@ -164,11 +165,12 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
 
 def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:
     """Of fits that fell on the same place keep the better one (best first)."""
-    dx, dy = (at[:, None] - at for at in fits.position_px.T)
-    near = dx * dx + dy * dy < (0.5 * fits.radius_px[:, None]) ** 2
+    if len(fits.depth) == 0:
+        return fits
+    near = KDTree(fits.position_px).query_ball_point(fits.position_px, 0.5 * fits.radius_px)
     order, kept = np.argsort(misfit(fits, noise) + (1 - fits.explained)), np.zeros(len(near), bool)
     for i in order:
-        kept[i] = not (near[i] & kept).any()
+        kept[i] = not kept[near[i]].any()
     return fits.rows(order[kept[order]])
 
 
