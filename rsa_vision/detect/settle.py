@@ -113,7 +113,8 @@ def settle(
             both = OF_SHIFT * apart[:, :, None] * apart[:, None] * edged[part, None, None]  # both models could be right
             both += OF_SHIFT * ((apart**2).sum(axis=1) * crossed)[:, None, None] * np.eye(2)  # what lies on a ball has any profile
             fits.covariance[:, :2, :2] += both
-            moved = free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left))
+            chance = np.einsum("ni,ni->n", apart, np.linalg.solve(balls.covariance[part, :2, :2], apart[:, :, None])[:, :, 0])
+            moved = free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left | (chance > _USUAL)))
             out = _put(out, part, fits, moved)
             stay = free[part] & crossed & ~moved
             out.covariance[part[stay], :2, :2] += both[stay]
