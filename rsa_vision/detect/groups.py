@@ -36,6 +36,8 @@ def fit_group(
     others: Any = None,
     *,
     edge: bool = False,
+    taken: bool = False,
+    bent: bool = False,
 ) -> BallFits:
     """Fit several balls in one window on one background.
 
@@ -51,6 +53,10 @@ def fit_group(
         ``others(cols, rows)``: images of neighbours outside the group, subtracted first.
     edge : bool
         The background also holds an edge: any profile across the direction in which the window changes most (:func:`edge_profile`).
+    taken : bool
+        Balls take away their part of it.
+    bent : bool
+        It may be curved.
 
     Returns
     -------
@@ -89,16 +95,18 @@ def fit_group(
         radius = np.clip(radius + scale * move[2], low, high)
         converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
         if edge:
-            ground = _under(images.value, surface @ theta[k : k + surface.shape[1]])
+            if taken:
+                ground = _under(images.value, surface @ theta[k : k + surface.shape[1]])
             if step in _LOOKED_AGAIN:
                 bare = data - images.linear[:, :k] @ theta[:k] - images.of_ground(theta)
-                surface = np.column_stack([window.surface, edge_profile(bare, valid, sigma_px)])
+                surface = np.column_stack([window.surface, edge_profile(bare, valid, sigma_px, bent=bent)])
         images = _images(window, surface, local, radius, sigma_px, mu_px, ground)
         theta = weighted_least_squares(images.linear, weight, data, 1e-9)
     root = np.sqrt(weight)[:, None]
     estimator = _estimator(jac * root, size, noise)[: 4 * k]
     last = (estimator @ (residual * root[:, 0])).reshape(4, k)
-    influence = np.concatenate([estimator, _estimator(linear * root, size, noise)[:k]]).reshape(5 * k, size, size)
+    certain = [i for i in range(linear.shape[1]) if i not in images.of_grounds]  # whether it is there, not how much of the edge it takes
+    influence = np.concatenate([estimator, _estimator(linear[:, certain] * root, size, noise)[:k]]).reshape(5 * k, size, size)
     whole = influence_covariance(influence, noise.correlation)
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
     core = distance < (radius + sigma_px)[:, None]
@@ -208,18 +216,20 @@ class _Images:
         k = len(self.value)
         by_shape = theta[:k, None] * self.slopes
         if self.ground is not None:
-            by_shape += self._of_grounds(theta)[:, None] * self.ground * self.slopes
+            by_shape += theta[self.of_grounds, None] * self.ground * self.slopes
         for of_product, pair, by in zip(theta[len(theta) - len(self.pairs) :], self.pairs, self.of_pairs, strict=True):
             by_shape[:, list(pair)] += of_product * by.transpose(1, 0, 2)
         return columns([by_shape.reshape(3 * k, -1), self.linear.T])
 
     def of_ground(self, theta: Float) -> Float:
         """Return what balls take away of the edge under them, shape (n,)."""
-        return np.zeros(self.value.shape[1]) if self.ground is None else self._of_grounds(theta) @ (self.ground * self.value)
+        return np.zeros(self.value.shape[1]) if self.ground is None else theta[self.of_grounds] @ (self.ground * self.value)
 
-    def _of_grounds(self, theta: Float) -> Float:
-        first = len(theta) - len(self.pairs) - len(self.value)
-        return theta[first : first + len(self.value)]
+    @property
+    def of_grounds(self) -> range:
+        """Which of the linear columns those are."""
+        end = self.linear.shape[1] - len(self.pairs)
+        return range(end - (0 if self.ground is None else len(self.value)), end)
 
 
 def _under(value: Float, background: Float) -> Float:
@@ -249,12 +259,11 @@ def _images(
     return _Images(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, ground, pairs, of_pairs)
 
 
-def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
+def edge_profile(bare: Float, valid: Float, sigma_px: float, *, bent: bool = False) -> Float:
     """Return functions that together make any smooth profile across the strongest edge of a window.
 
     The edge of a bone or an implant is nearly a circle over the width of a window: it changes across, not along. A ball changes both
-    ways, so its centre stays determined, if less well across the edge; the covariance knows. Direction and curvature are those of the
-    gradients.
+    ways, so its centre stays determined, if less well across the edge; the covariance knows.
 
     Parameters
     ----------
@@ -264,6 +273,8 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
         1, or 0 where masked.
     sigma_px : float
         Blur of the film: nothing changes faster.
+    bent : bool
+        With direction and curvature of the gradients.
 
     Returns
     -------
@@ -281,11 +292,11 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
     across = np.linalg.eigh(tensor)[1][:, 1]
     steps = np.arange(size) - (size - 1) / 2
     t, along = ((steps * x + (steps * y)[:, None]).ravel() for x, y in (across, (-across[1], across[0])))
-    # of circles around one centre gradients turn in proportion to the way along
-    forward, aside = across @ by, np.array([-across[1], across[0]]) @ by
-    turn, bend = weighted_least_squares(np.stack([forward, forward * along], axis=1), inside.ravel(), aside)
-    most = 2 * _MOST_BENT / size
-    t = t + turn * along + 0.5 * np.clip(bend, -most, most) * along**2
+    if bent:  # around one centre gradients turn in proportion to the way along the edge
+        forward, aside = across @ by, np.array([-across[1], across[0]]) @ by
+        turn, bend = weighted_least_squares(np.stack([forward, forward * along], axis=1), inside.ravel(), aside)
+        most = 2 * _MOST_BENT / size
+        t += turn * along + 0.5 * np.clip(bend, -most, most) * along**2
     step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
     place = (t - t.min()) / step
     knot = place.astype(np.intp)

@@ -34,6 +34,7 @@ _MOST_IN_GROUP = 5
 OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added to the stated variance
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
 _FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
+_MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: each makes what else is fitted less sure
 NEAR_EDGES = 2.5  # times the misfit that balls may leave: what an edge beside them adds to it
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _LIKE = 0.35  # logarithm of the radius, against the film's median
@@ -126,12 +127,12 @@ def resolve_balls(
         fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
     found = join([single.rows(slice(0)), *fits])
     found = found.rows(~_cancelled(found))
-    # two explain much: they must explain it well
-    alone = ~_in_one_beam(found) | (plausible(found, noise) & (misfit(found, noise) < DOUBTFUL * MISFIT))
-    alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1) < _LIKE
-    found = found.rows(
-        alone & (plausible(found, noise) | (alike & plausible(found, noise, NEAR_EDGES))) & inside(found, film) & ~_taken(found, drawn)
-    )
+    found = found.rows(inside(found, film) & ~_taken(found, drawn))
+    balls = plausible(found, noise)
+    alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
+    perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
+    found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
+    found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
     found, edged = beside_edges(film, distinct(found, noise), optics, noise, tees)
     balls = plausible(found, noise)
     found, edged = found.rows(balls), edged[balls]
@@ -166,9 +167,17 @@ def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
             parts.append(plain)
             continue
         flat = fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside)
-        edged = fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, edge=True)
-        gain = 2 * (edged.log_likelihood[0] - flat.log_likelihood[0]) / noise.correlation.sum()
-        if gain < EDGE_GAIN or not edged.converged.all():
+        models: list[BallFits] = []
+        for taken, bent in ((False, False), (True, False), (False, True), (True, True)):
+            how = {"edge": True, "taken": taken, "bent": bent}
+            models.append(fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, **how))
+        worths = [
+            _gain(m, models[0], noise) - _MORE_GAIN * more if m.converged.all() else -np.inf
+            for m, more in zip(models, (0, 1, 1, 2), strict=True)
+        ]
+        edged = models[int(np.argmax(worths))]
+        lost = plausible(plain, noise) & ~plausible(edged, noise)
+        if _gain(edged, flat, noise) < EDGE_GAIN or not edged.converged.all() or lost.any():
             parts.append(plain)
             continue
         shift = edged.position_px - plain.position_px
@@ -177,6 +186,11 @@ def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
         parts.append(replace(edged, covariance=covariance))
         edged_too[-1][:] = True
     return join(parts), np.concatenate([np.zeros(0, bool), *edged_too])
+
+
+def _gain(fits: BallFits, simpler: BallFits, noise: NoiseModel) -> float:
+    """Return twice the log-likelihood that one model of a group gains over another."""
+    return float(2 * (fits.log_likelihood[0] - simpler.log_likelihood[0]) / noise.correlation.sum())
 
 
 def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
