@@ -56,11 +56,22 @@ def hopeless(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:
         return np.zeros(len(pattern), bool)
     height = _height(fits, sigma_px)
     faint = (height < UNEXCUSED * np.median(height[pattern])) & (fits.explained < EXPLAINED)
-    high = min(_FAR * _LARGER * radii.max(), RADIUS_PX[1])
-    unlike = (fits.radius_px < _SMALLER / _FAR * radii.min()) | (fits.radius_px >= high) | (misfit(fits, noise) > 2 * MISFIT)
+    unlike = ~_near_in_size(fits, radii) | (misfit(fits, noise) > 2 * MISFIT)
     over_noise = height / np.sqrt(noise.variance_at(fits.background))
     lost = np.logical_and(*(h < _LOST * FAINT * np.median(h[pattern]) for h in (height, over_noise)))
     return np.asarray((faint & unlike) | lost)
+
+
+def of_size(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:
+    """Say which fits are clear, or of a size from which a better one may come to that of clear ones; as for :func:`hopeless`."""
+    pattern = look_clear(fits, noise)
+    radii = _sizes(fits, pattern, sigma_px)
+    return np.asarray(pattern | _near_in_size(fits, radii)) if len(radii) >= LEAST_KNOWN else np.ones(len(pattern), bool)
+
+
+def _near_in_size(fits: BallFits, radii: Float) -> Bool:
+    high = min(_FAR * _LARGER * float(radii.max()), RADIUS_PX[1])
+    return np.asarray((fits.radius_px >= _SMALLER / _FAR * radii.min()) & (fits.radius_px < high))
 
 
 def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:

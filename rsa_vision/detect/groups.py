@@ -21,6 +21,8 @@ from rsa_vision.types import Float
 
 _STEPS = 25
 _CONVERGED_PX = 1e-3
+_LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
+_MOST_BENT = 1.0  # half windows to a radius
 KNOTS = 1.5  # blur widths between the knots of a profile across an edge
 
 
@@ -34,6 +36,8 @@ def fit_group(
     others: Any = None,
     *,
     edge: bool = False,
+    taken: bool = False,
+    bent: bool = False,
 ) -> BallFits:
     """Fit several balls in one window on one background.
 
@@ -49,6 +53,10 @@ def fit_group(
         ``others(cols, rows)``: images of neighbours outside the group, subtracted first.
     edge : bool
         The background also holds an edge: any profile across the direction in which the window changes most (:func:`edge_profile`).
+    taken : bool
+        Balls take away their part of it.
+    bent : bool
+        It may be curved.
 
     Returns
     -------
@@ -68,6 +76,7 @@ def fit_group(
         surface = np.column_stack([surface, edge_profile(data - images.value.T @ theta[:k], valid, sigma_px)])
         images = _images(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-6)
+    ground: Float | None = None
     converged, before = False, np.zeros((3, k))
     for step in range(_STEPS + 1):
         value, linear, jac = images.value, images.linear, images.jacobian(theta)
@@ -85,12 +94,19 @@ def fit_group(
         local = local + scale * move[:2].T
         radius = np.clip(radius + scale * move[2], low, high)
         converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
-        images = _images(window, surface, local, radius, sigma_px, mu_px)
+        if edge:
+            if taken:
+                ground = _under(images.value, surface @ theta[k : k + surface.shape[1]])
+            if step in _LOOKED_AGAIN:
+                bare = data - images.linear[:, :k] @ theta[:k] - images.of_ground(theta)
+                surface = np.column_stack([window.surface, edge_profile(bare, valid, sigma_px, bent=bent)])
+        images = _images(window, surface, local, radius, sigma_px, mu_px, ground)
         theta = weighted_least_squares(images.linear, weight, data, 1e-9)
     root = np.sqrt(weight)[:, None]
     estimator = _estimator(jac * root, size, noise)[: 4 * k]
     last = (estimator @ (residual * root[:, 0])).reshape(4, k)
-    influence = np.concatenate([estimator, _estimator(linear * root, size, noise)[:k]]).reshape(5 * k, size, size)
+    certain = [i for i in range(linear.shape[1]) if i not in images.of_grounds]  # whether it is there, not how much of the edge it takes
+    influence = np.concatenate([estimator, _estimator(linear[:, certain] * root, size, noise)[:k]]).reshape(5 * k, size, size)
     whole = influence_covariance(influence, noise.correlation)
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
     core = distance < (radius + sigma_px)[:, None]
@@ -190,7 +206,8 @@ class _Images:
 
     value: Float  # (k, n)
     slopes: Float  # (3, k, n), of each ball by its col, row and radius
-    linear: Float  # (n, p): balls, background, products of two
+    linear: Float  # (n, p): balls, background, products of balls with an edge under them, of two balls
+    ground: Float | None  # (k, n), the edge under each
     pairs: list[tuple[int, int]]
     of_pairs: list[Float]  # slopes of the products
 
@@ -198,12 +215,33 @@ class _Images:
         """Return the derivatives by all cols, rows and radii, then by the linear parameters; shape (n, 3 k + p)."""
         k = len(self.value)
         by_shape = theta[:k, None] * self.slopes
+        if self.ground is not None:
+            by_shape += theta[self.of_grounds, None] * self.ground * self.slopes
         for of_product, pair, by in zip(theta[len(theta) - len(self.pairs) :], self.pairs, self.of_pairs, strict=True):
             by_shape[:, list(pair)] += of_product * by.transpose(1, 0, 2)
         return columns([by_shape.reshape(3 * k, -1), self.linear.T])
 
+    def of_ground(self, theta: Float) -> Float:
+        """Return what balls take away of the edge under them, shape (n,)."""
+        return np.zeros(self.value.shape[1]) if self.ground is None else theta[self.of_grounds] @ (self.ground * self.value)
 
-def _images(window: _Window, surface: Float, local: Float, radius: Float, sigma_px: float, mu_px: float) -> _Images:
+    @property
+    def of_grounds(self) -> range:
+        """Which of the linear columns those are."""
+        end = self.linear.shape[1] - len(self.pairs)
+        return range(end - (0 if self.ground is None else len(self.value)), end)
+
+
+def _under(value: Float, background: Float) -> Float:
+    """Return by how much the background differs from its mean under each ball, at most by one; shape (k, n)."""
+    mean = (value @ background) / np.maximum(value.sum(axis=1), 1e-9)
+    apart = background - mean[:, None]
+    return np.asarray(apart / max(float(np.abs(apart).max()), 1e-9))
+
+
+def _images(
+    window: _Window, surface: Float, local: Float, radius: Float, sigma_px: float, mu_px: float, ground: Float | None = None
+) -> _Images:
     dx, dy = window.cols - local[:, :1], window.rows - local[:, 1:]
     rho = np.hypot(dx, dy)
     value, slope, slope_r = ball_table(round(mu_px * sigma_px, 3)).evaluate(rho / sigma_px, radius / sigma_px)
@@ -216,15 +254,16 @@ def _images(window: _Window, surface: Float, local: Float, radius: Float, sigma_
         product, by = product_image(local[list(pair)], radius[list(pair)], sigma_px, mu_px, window.size)
         if product.max() > LEAST:
             pairs, products, of_pairs = [*pairs, pair], [*products, product[None]], [*of_pairs, by]
-    linear = columns([value, surface.T, *products])
-    return _Images(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, pairs, of_pairs)
+    # a mark takes away its part of what is there: on linear films more beside an implant than behind it, on films of density as much
+    linear = columns([value, surface.T, *([] if ground is None else [ground * value]), *products])
+    return _Images(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, ground, pairs, of_pairs)
 
 
-def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
+def edge_profile(bare: Float, valid: Float, sigma_px: float, *, bent: bool = False) -> Float:
     """Return functions that together make any smooth profile across the strongest edge of a window.
 
-    The edge of a bone or an implant is straight over the width of a ball: it changes across, not along. A ball changes both ways, so its
-    centre stays determined, if less well across the edge; the covariance knows.
+    The edge of a bone or an implant is nearly a circle over the width of a window: it changes across, not along. A ball changes both
+    ways, so its centre stays determined, if less well across the edge; the covariance knows.
 
     Parameters
     ----------
@@ -234,6 +273,8 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
         1, or 0 where masked.
     sigma_px : float
         Blur of the film: nothing changes faster.
+    bent : bool
+        With direction and curvature of the gradients.
 
     Returns
     -------
@@ -250,7 +291,12 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float) -> Float:
     tensor = (by * inside.ravel()) @ by.T
     across = np.linalg.eigh(tensor)[1][:, 1]
     steps = np.arange(size) - (size - 1) / 2
-    t = (steps * across[0] + (steps * across[1])[:, None]).ravel()
+    t, along = ((steps * x + (steps * y)[:, None]).ravel() for x, y in (across, (-across[1], across[0])))
+    if bent:  # around one centre gradients turn in proportion to the way along the edge
+        forward, aside = across @ by, np.array([-across[1], across[0]]) @ by
+        turn, bend = weighted_least_squares(np.stack([forward, forward * along], axis=1), inside.ravel(), aside)
+        most = 2 * _MOST_BENT / size
+        t += turn * along + 0.5 * np.clip(bend, -most, most) * along**2
     step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
     place = (t - t.min()) / step
     knot = place.astype(np.intp)

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear
+from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear, of_size
 from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
 from rsa_vision.detect.noise import NoiseModel
@@ -34,6 +34,8 @@ _MOST_IN_GROUP = 5
 OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added to the stated variance
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
 _FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
+_MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: each makes what else is fitted less sure
+NEAR_EDGES = 2.5  # times the misfit that balls may leave: what an edge beside them adds to it
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
@@ -125,9 +127,15 @@ def resolve_balls(
         fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
     found = join([single.rows(slice(0)), *fits])
     found = found.rows(~_cancelled(found))
-    found = found.rows(plausible(found, noise) & inside(found, film))
+    found = found.rows(inside(found, film) & ~_taken(found, drawn))
+    balls = plausible(found, noise)
+    alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
+    perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
-    found, edged = _beside_edges(film, distinct(found.rows(~_taken(found, drawn)), noise), optics, noise, tees)
+    found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
+    found, edged = beside_edges(film, distinct(found, noise), optics, noise, tees)
+    balls = plausible(found, noise)
+    found, edged = found.rows(balls), edged[balls]
     by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)
     found, edged = join([found, drawn]), np.append(edged, np.zeros(len(drawn.depth), bool))
     touching = np.zeros(len(found.depth), bool)
@@ -136,12 +144,13 @@ def resolve_balls(
     return found, touching, edged, by_spot
 
 
-def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> tuple[BallFits, Bool]:
+def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> tuple[BallFits, Bool]:
     """Fit again, with an edge in the background, the balls that lie on or beside one (the likelihood tells); say which they are.
 
     An edge that a quadratic surface cannot follow pulls the centre. What the edge model moves it by says how much is at stake: half of that
     is added to the stated error, since edges bend and have other profiles than the model's.
     """
+    fits = fits.rows(of_size(fits, optics.sigma_px, noise))
     parts, edged_too = [fits.rows(slice(0))], []
     worth = ~hopeless(fits, optics.sigma_px, noise)
     for g in _groups(fits, optics):
@@ -158,9 +167,17 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
             parts.append(plain)
             continue
         flat = fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside)
-        edged = fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, edge=True)
-        gain = 2 * (edged.log_likelihood[0] - flat.log_likelihood[0]) / noise.correlation.sum()
-        if gain < EDGE_GAIN or not edged.converged.all():
+        models: list[BallFits] = []
+        for taken, bent in ((False, False), (True, False), (False, True), (True, True)):
+            how = {"edge": True, "taken": taken, "bent": bent}
+            models.append(fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, **how))
+        worths = [
+            _gain(m, models[0], noise) - _MORE_GAIN * more if m.converged.all() else -np.inf
+            for m, more in zip(models, (0, 1, 1, 2), strict=True)
+        ]
+        edged = models[int(np.argmax(worths))]
+        lost = plausible(plain, noise) & ~plausible(edged, noise)
+        if _gain(edged, flat, noise) < EDGE_GAIN or not edged.converged.all() or lost.any():
             parts.append(plain)
             continue
         shift = edged.position_px - plain.position_px
@@ -169,6 +186,11 @@ def _beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Noi
         parts.append(replace(edged, covariance=covariance))
         edged_too[-1][:] = True
     return join(parts), np.concatenate([np.zeros(0, bool), *edged_too])
+
+
+def _gain(fits: BallFits, simpler: BallFits, noise: NoiseModel) -> float:
+    """Return twice the log-likelihood that one model of a group gains over another."""
+    return float(2 * (fits.log_likelihood[0] - simpler.log_likelihood[0]) / noise.correlation.sum())
 
 
 def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:

@@ -18,7 +18,7 @@ from rsa_vision.detect.find import distinct, fit_at, plausible, promising
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import images_beside, inside
+from rsa_vision.detect.resolve import NEAR_EDGES, beside_edges, images_beside, inside
 from rsa_vision.types import Bool, Float
 
 _CLEAR = 0.9  # of the limit, over clutter
@@ -29,7 +29,7 @@ _SIZE = 1.6  # ratio of the fitted radius to the usual one
 
 def look_again(
     film: NDArray[Any], candidates: Candidates, balls: BallFits, limit: float, optics: Optics, noise: NoiseModel, needles: Painted | None
-) -> BallFits:
+) -> tuple[BallFits, Bool]:
     """Fit balls of the usual size at the candidates where none was found.
 
     Parameters
@@ -48,10 +48,12 @@ def look_again(
 
     Returns
     -------
-    BallFits
+    fits : BallFits
         What may be balls, beside those found so far.
+    edged : ndarray of bool, shape (n,)
+        Fitted together with an edge.
     """
-    none = balls.rows(np.zeros(len(balls.depth), bool))
+    none = balls.rows(np.zeros(len(balls.depth), bool)), np.zeros(0, bool)
     if len(balls.depth) < LEAST_KNOWN:
         return none
     usual = float(np.median(balls.radius_px))
@@ -70,15 +72,17 @@ def look_again(
         fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick)
         stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
         enough = promising(fits, limit, optics.sigma_px, noise) if quick else over_clutter(fits) > _CLEAR * limit
-        fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise) & enough), noise)
+        fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
         place = fits.position_px
-    return fits
+    fits, edged = beside_edges(film, fits, optics, noise, lambda cols, rows: others(0, cols, rows)[0])
+    like = _like_a_ball(fits, limit, noise)
+    return fits.rows(like), edged[like]
 
 
-def _like_a_ball(fits: BallFits, limit: float, noise: NoiseModel) -> Bool:
+def _like_a_ball(fits: BallFits, limit: float, noise: NoiseModel, slack: float = _SLACK) -> Bool:
     """Say which are plausible; what stands out far may leave more: dust, an edge or bone lies over balls as well."""
     far = over_clutter(fits) > _FAR * limit
-    return np.asarray(plausible(fits, noise) | (far & plausible(fits, noise, _SLACK)))
+    return np.asarray(plausible(fits, noise) | (far & plausible(fits, noise, slack)))
 
 
 def _near(position_px: Float, balls: BallFits, radius_px: float) -> Bool:

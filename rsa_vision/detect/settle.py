@@ -107,13 +107,16 @@ def settle(
             excess = np.maximum(under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
             specks = find_specks(solution, solution.radius_px + optics.sigma_px, windows.fits.depth, excess, 2 * these.half + 1, noise)
             fits = _fits(windows, solution, specks, known, common)
-            left = fits.chi2_uneven - balls.chi2_uneven[part] > CHANCE * noise.scatter(fits.n_core)
+            better = (balls.chi2_uneven[part] - fits.chi2_uneven) / noise.scatter(fits.n_core)
             covered[part] = windows.covered
             crossed, apart = (windows.covered > 0) & (windows.covered <= MOST_COVERED), fits.position_px - balls.position_px[part]
             both = OF_SHIFT * apart[:, :, None] * apart[:, None] * edged[part, None, None]  # both models could be right
             both += OF_SHIFT * ((apart**2).sum(axis=1) * crossed)[:, None, None] * np.eye(2)  # what lies on a ball has any profile
             fits.covariance[:, :2, :2] += both
-            moved = free[part] & ~(edged[part] & ((fits.chi2_ring > STRUCTURE) | left))
+            # there is an edge, which surfaces do not know: they are believed if they agree with it, or leave less
+            chance = np.einsum("ni,ni->n", apart, np.linalg.solve(balls.covariance[part, :2, :2], apart[:, :, None])[:, :, 0])
+            stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _USUAL) & (better < CHANCE))
+            moved = free[part] & ~(edged[part] & stays)
             out = _put(out, part, fits, moved)
             stay = free[part] & crossed & ~moved
             out.covariance[part[stay], :2, :2] += both[stay]
