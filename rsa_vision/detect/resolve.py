@@ -68,7 +68,7 @@ def resolve_balls(
     fits : BallFits
         Those that are balls.
     touching : ndarray of bool, shape (n,)
-        Fitted together with a neighbour.
+        Fitted together with a neighbour, or perhaps two.
     edged : ndarray of bool, shape (n,)
         Fitted together with an edge.
     drawn : ndarray of bool, shape (n,)
@@ -84,7 +84,7 @@ def resolve_balls(
     others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-    drawn, spot = find_spot(film, single.rows(~clean), single.rows(clean & look_clear(single, noise)), optics, noise, others)
+    drawn, spot, in_doubt = find_spot(film, single.rows(~clean), single.rows(clean & look_clear(single, noise)), optics, noise, others)
     if spot is not None:
         rest = ~_taken(single, drawn)
         single, clean, tees = single.rows(rest), clean[rest], with_spot(tees, drawn, spot, optics)
@@ -133,6 +133,7 @@ def resolve_balls(
     touching = np.zeros(len(found.depth), bool)
     for g in _groups(found, optics):
         touching[g] = len(g) > 1
+    touching[by_spot] |= in_doubt
     return found, touching, edged, by_spot
 
 
