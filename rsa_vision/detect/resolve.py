@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
+from rsa_vision.detect.crowds import resolve_crowds
 from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear
 from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
@@ -127,7 +128,17 @@ def resolve_balls(
     found = found.rows(~_cancelled(found))
     found = found.rows(plausible(found, noise) & inside(found, film))
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
-    found, edged = _beside_edges(film, distinct(found.rows(~_taken(found, drawn)), noise), optics, noise, tees)
+    found = distinct(found.rows(~_taken(found, drawn)), noise)
+    crowds = resolve_crowds(
+        film,
+        candidates,
+        found,
+        optics,
+        noise,
+        lambda: _beside(found, np.arange(0), optics, tees),
+        lambda places, radius: _deep(film, places, radius, tees),
+    )
+    found, edged = _beside_edges(film, join([found, *crowds]), optics, noise, tees)
     by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)
     found, edged = join([found, drawn]), np.append(edged, np.zeros(len(drawn.depth), bool))
     touching = np.zeros(len(found.depth), bool)
