@@ -208,12 +208,12 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
 
 def _in_one_beam(fits: BallFits) -> Bool:
     """Say whose shadow lies over that of another ball."""
-    return np.asarray((_lapping(fits) & ~np.eye(len(fits.depth), dtype=bool)).any(axis=1))
+    return np.asarray((lapping_balls(fits) & ~np.eye(len(fits.depth), dtype=bool)).any(axis=1))
 
 
 def _cancelled(fits: BallFits) -> Bool:
     """Say over which lies one of the other polarity: together they may explain anything."""
-    return np.asarray((_lapping(fits) & (np.sign(fits.depth)[:, None] != np.sign(fits.depth))).any(axis=1))
+    return np.asarray((lapping_balls(fits) & (np.sign(fits.depth)[:, None] != np.sign(fits.depth))).any(axis=1))
 
 
 def doubt_of_number(fits: BallFits) -> Float:
@@ -233,7 +233,7 @@ def doubt_of_number(fits: BallFits) -> Float:
     out = np.zeros((len(fits.depth), 2, 2))
     if len(out) == 0:
         return out
-    lapping: Any = _lapping(fits)
+    lapping: Any = lapping_balls(fits)
     _, label = connected_components(csr_array(lapping), directed=False)
     for k in np.flatnonzero(np.bincount(label) > 2):
         members = np.flatnonzero(label == k)
@@ -245,7 +245,8 @@ def doubt_of_number(fits: BallFits) -> Float:
     return out
 
 
-def _lapping(fits: BallFits) -> Bool:
+def lapping_balls(fits: BallFits) -> Bool:
+    """Say whose shadows lie over each other, shape (n, n); each over its own."""
     gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
     return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
 
