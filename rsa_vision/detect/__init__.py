@@ -217,7 +217,7 @@ def _one_polarity(
     keep = left < BENT * MISFIT
     keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
     balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
-    poor = lapping_balls(balls)[:, poor].any(axis=1)  # what one of them leaves may be another's
+    poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
     images = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
     cut_off = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED)) != 0
     trust = np.where(images.flags & MarkerFlag.POOR_FIT, 0.0, np.where(cut_off, _OF_CUT_OFF, 1.0))

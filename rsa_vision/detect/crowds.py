@@ -9,32 +9,38 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect.alike import true_spread
-from rsa_vision.detect.balls import BallFits
-from rsa_vision.detect.blobs import LEAST_APART, LEAST_GAIN, STRETCH, long_axis
+from rsa_vision.detect.balls import BallFits, join
+from rsa_vision.detect.blobs import LEAST_APART, STRETCH, long_axis
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.decide import LEAST_KNOWN, look_clear
-from rsa_vision.detect.find import DOUBTFUL, MISFIT, fit_at, misfit, plausible
+from rsa_vision.detect.find import CHANCE, DOUBTFUL, MISFIT, fit_at, misfit, plausible
 from rsa_vision.detect.groups import fit_group, images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import weighted_least_squares
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
 _MOST = 4  # balls of a crowd
-_CROWDS = 100  # most of a film, those that stand out most
+_VAIN = 40  # attempts of a film that may fail; what one ball explains best goes first
 _EXPLAINED = 0.6  # least that one ball explains of what a few make
-_SIZES = (0.7, 3.5)  # radii of that ball, relative to the film's
-_DEEP = (0.4, 2.5)  # depths relative to the film's usual one, of balls, and the least of a place
-_HOPELESS = 3.0  # times the misfit a ball may leave: one more ball than fitted will not mend that
+_START, _SIZES = 1.4, (0.7, 3.5)  # radii of that ball, relative to the film's: to begin with, and those that count
+_DEEP = 0.4  # least depth of a place, relative to the film's usual one
+_HOPELESS, _LARGE = 2.0, 1.6  # times the misfit a ball may leave, and the usual radius: one ball more will not mend that
 _SURE = 3.0  # standard deviations
-_LEAST_SPREAD = 0.05  # of the logarithms of radii
+_DIFFER = 0.04  # of radii and of depths, by which balls of one size and beam do
+_LEFT = 0.3  # of the misfit that a ball may leave, beyond what the film's do
 _LINE = 0.61  # of the separation that the second moments suggest of two, where three are in a row
 
 
 def resolve_crowds(
-    film: NDArray[Any], candidates: Candidates, found: BallFits, optics: Optics, noise: NoiseModel, beside: Callable[[Any], Any], deep: Any
-) -> list[BallFits]:
+    film: NDArray[Any],
+    candidates: Candidates,
+    found: BallFits,
+    optics: Optics,
+    noise: NoiseModel,
+    beside: Callable[[BallFits, Int], Any],
+    deep: Callable[[Float, float], Float],
+) -> BallFits:
     """Explain what was left over by a few of the film's own balls.
 
     Parameters
@@ -47,45 +53,61 @@ def resolve_crowds(
     optics : Optics
     noise : NoiseModel
     beside : callable
-        ``beside()``: images of the known balls and tees, for the fits to subtract.
+        ``beside(balls, members)``: what makes the images of the tees and of all these balls but the members, for the fits to subtract.
     deep : callable
-        ``deep(places, radius)``: how far the film differs there from its surroundings.
+        ``deep(places, radius)``: how far the film differs there from what is around a ball of that radius.
 
     Returns
     -------
-    list of BallFits
-        One for each crowd.
+    BallFits
+        Those found, and the balls of crowds.
     """
     known = found.rows(look_clear(found, noise))
     if len(known.depth) < LEAST_KNOWN:
-        return []
+        return found
     radius, depth = float(np.median(known.radius_px)), float(np.median(known.depth))
+    others = beside(found, np.arange(0))
+
+    def others_of(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+        return others(cols, rows), np.zeros(cols.shape, bool)
+
     place = candidates.position_px
     gap = np.hypot(*(place[:, None] - found.position_px[None]).transpose(2, 0, 1))
     place = place[(gap > found.radius_px + 0.6 * radius).all(axis=1)]
-    place = place[deep(place, radius) > _DEEP[0] * abs(depth)]
+    place = place[deep(place, radius) > _DEEP * abs(depth)]
     if len(place) == 0:
-        return []
-    others = beside()
-    single = fit_at(film, place, np.full(len(place), 1.4 * radius), optics, noise, lambda _, c, r: (others(c, r), np.zeros(c.shape, bool)), quick=True)
+        return found
+    single = fit_at(film, place, np.full(len(place), _START * radius), optics, noise, others_of, quick=True)
     size = single.radius_px / radius
     worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (single.explained > _EXPLAINED) & (np.sign(single.depth) == np.sign(depth))
-    worth &= np.abs(single.depth) > _DEEP[0] * abs(depth)
+    worth &= np.abs(single.depth) > _DEEP * abs(depth)
     single = single.rows(worth)
     single = single.rows(np.argsort(-single.explained))
-    out: list[BallFits] = []
-    tried = np.zeros((0, 2))
-    for i in range(len(single.depth)):
-        if len(tried) >= _CROWDS:
+    vain = np.zeros((0, 2))
+    for i, at in enumerate(single.position_px):
+        if len(vain) == _VAIN:
             break
-        at = single.position_px[[i]]
-        if (np.hypot(*(np.concatenate([tried, *[c.position_px for c in out]]) - at).T) < radius).any():
+        if (np.hypot(*(np.concatenate([vain, found.position_px]) - at).T) < radius).any():
             continue
-        tried = np.concatenate([tried, at])
         crowd = _crowd(film, single.rows([i]), known, optics, noise, others)
-        if crowd is not None:
-            out.append(crowd)
-    return out
+        if crowd is None:
+            vain = np.concatenate([vain, at[None]])
+        else:
+            found = _joined(film, found, crowd, optics, noise, beside)
+    return found
+
+
+def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, beside: Any) -> BallFits:
+    """Put a crowd to the balls found, fitted again together with those that it laps over."""
+    gap = np.hypot(*(found.position_px[:, None] - crowd.position_px[None]).transpose(2, 0, 1))
+    near = (gap < found.radius_px[:, None] + crowd.radius_px).any(axis=1)
+    if near.any():
+        start = join([found.rows(near), crowd])
+        others = beside(found, np.flatnonzero(near))
+        crowd = fit_group(film, start.position_px, start.radius_px, optics.sigma_px, optics.mu_px, noise, others)
+        if not (plausible(crowd, noise) & (misfit(crowd, noise) < DOUBTFUL * MISFIT)).all():
+            return found
+    return join([found.rows(~near), crowd])
 
 
 def _crowd(film: NDArray[Any], blob: BallFits, known: BallFits, optics: Optics, noise: NoiseModel, others: Any) -> BallFits | None:
@@ -102,7 +124,7 @@ def _crowd(film: NDArray[Any], blob: BallFits, known: BallFits, optics: Optics, 
         best = min(before, key=lambda fits: float(misfit(fits, noise).max()))
         if _all_balls(best, known, noise):
             return best
-        if misfit(best, noise).min() > _HOPELESS * MISFIT or count == _MOST:
+        if count == _MOST or misfit(best, noise).max() > _HOPELESS * MISFIT or best.radius_px.max() > _LARGE * radius:
             return None
         before = [fit(np.concatenate([best.position_px, _most_left(film, best, radius, optics, noise, others)]))]
         if count == 2:
@@ -124,22 +146,23 @@ def _most_left(film: NDArray[Any], fits: BallFits, radius: float, optics: Optics
 
 
 def _all_balls(fits: BallFits, known: BallFits, noise: NoiseModel) -> bool:
-    depth = np.abs(fits.depth) / np.median(np.abs(known.depth))
-    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(depth))
+    """Say whether these are like the film's clear balls, each in size and depth, and explain what they do as closely."""
+    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(fits.depth))
+    usual = float(np.median(known.chi2_core))
+    more = fits.chi2_core - usual
+    more = np.where(more > CHANCE * noise.scatter(fits.n_core) * usual, more, 0.0)
+    left = np.sqrt(more * noise.variance_at(fits.background)) / np.maximum(np.abs(fits.depth), 1e-9)
     return bool(
-        like_known(fits, known).all()
+        (left < _LEFT * MISFIT).all()
         and (np.sign(fits.depth) == np.sign(np.median(known.depth))).all()
-        and ((depth > _DEEP[0]) & (depth < _DEEP[1])).all()
         and gap.min() > LEAST_APART * fits.radius_px.min()
-        and (plausible(fits, noise) & (misfit(fits, noise) < DOUBTFUL * MISFIT)).all()
+        and plausible(fits, noise).all()
+        and _among(fits.radius_px, fits.covariance[:, 2, 2], known.radius_px, known.covariance[:, 2, 2]).all()
+        and _among(fits.depth, fits.covariance[:, 3, 3], known.depth, known.covariance[:, 3, 3]).all()
     )
 
 
-def like_known(fits: BallFits, known: BallFits) -> Bool:
-    """Say which balls are of a size that others of the film have, as far as sizes differ and are known."""
-    log, variance = (np.log(f.radius_px) for f in (fits, known)), known.covariance[:, 2, 2] / known.radius_px**2
-    mine, theirs = log
-    _, spread, _ = true_spread(theirs, variance)
-    own = fits.covariance[:, 2, 2] / fits.radius_px**2
-    allowed = _SURE * np.sqrt(own + np.clip(spread, _LEAST_SPREAD, 0.15) ** 2)
-    return np.asarray(np.abs(mine[:, None] - theirs).min(axis=1) < allowed)
+def _among(values: Float, variances: Float, known: Float, of_known: Float) -> Bool:
+    """Say which values are as those of three of the known ones."""
+    apart = np.abs(values[:, None] - known) / np.sqrt(variances[:, None] + of_known + (_DIFFER * known) ** 2)
+    return np.asarray(np.sort(apart, axis=1)[:, LEAST_KNOWN - 1] < _SURE)

@@ -113,8 +113,8 @@ def resolve_balls(
     for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
         index = np.array(g)
         if 1 < len(g) <= _MOST_IN_GROUP:
-            beside = _beside(known, index, optics, tees)
-            fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, beside))
+            near = _beside(known, index, optics, tees)
+            fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, near))
         elif len(g) > _MOST_IN_GROUP:
             fits.append(_peel(film, good.rows(index), optics, noise, tees))
     alone = np.array([g[0] for g in groups if len(g) == 1], dtype=np.intp)
@@ -129,16 +129,16 @@ def resolve_balls(
     found = found.rows(plausible(found, noise) & inside(found, film))
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
     found = distinct(found.rows(~_taken(found, drawn)), noise)
-    crowds = resolve_crowds(
+    found = resolve_crowds(
         film,
         candidates,
         found,
         optics,
         noise,
-        lambda: _beside(found, np.arange(0), optics, tees),
-        lambda places, radius: _deep(film, places, radius, tees),
+        lambda balls, members: _beside(balls, members, optics, tees),
+        lambda at, radius: _deep(film, at, radius, tees),
     )
-    found, edged = _beside_edges(film, join([found, *crowds]), optics, noise, tees)
+    found, edged = _beside_edges(film, found, optics, noise, tees)
     by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)
     found, edged = join([found, drawn]), np.append(edged, np.zeros(len(drawn.depth), bool))
     touching = np.zeros(len(found.depth), bool)

@@ -1,4 +1,4 @@
-"""Two exposures on one film: images that lie over each other are two balls, and neither one ball through a spot nor nothing."""
+"""Images that lie over each other are two balls or three of the film's own: neither one ball through a spot, nor nothing."""
 
 from __future__ import annotations
 
@@ -43,4 +43,36 @@ def assert_all_are_measured(found: Detection, truth: NDArray[np.float64]) -> Non
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_pairs_are_not_taken_for_balls_drawn_by_a_focal_spot(seed: int, apart: float, contrast: float) -> None:
     film, truth, _ = film_of_pairs(seed, apart, contrast)
+    assert_all_are_measured(detect_markers(stored(film), bits=16), truth)
+
+
+@pytest.mark.parametrize("contrast", [40.0, 12.0])
+def test_pairs_that_look_like_no_ball_at_first_sight_do_not_vanish(contrast: float) -> None:
+    film, truth, _ = film_of_pairs(1, 0.75, contrast)
+    assert_all_are_measured(detect_markers(stored(film), bits=16), truth)
+
+
+def test_three_in_a_row_and_more_than_forty_pairs_do_not_vanish() -> None:
+    rng = np.random.default_rng(1)
+    place, _ = grid_of_balls(rng, 9, 60.0, (4.0, 4.0))
+    place = rng.permutation(place)
+    turn = rng.uniform(0, 2 * np.pi, 60)
+    step = 2 * RADIUS_PX * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    threes, pairs, clear = place[:10], place[10:60], place[60:]
+    truth = np.concatenate(
+        [threes, threes - 0.8 * step[:10], threes + 0.8 * step[:10], pairs - 0.3 * step[10:], pairs + 0.3 * step[10:], clear]
+    )
+    radius = np.full(len(truth), RADIUS_PX)
+    film = film_of_balls((590, 590), truth, radius, depth=DEPTH, sigma_px=1.4, noise_sd=30000 * DEPTH / 30, rng=rng)
+    assert_all_are_measured(detect_markers(stored(film), bits=16), truth)
+
+
+def test_neighbours_of_two_sizes_that_the_film_has_are_told_apart() -> None:
+    rng = np.random.default_rng(2)
+    place, _ = grid_of_balls(rng, 6, 60.0, (4.0, 4.0))
+    turn = rng.uniform(0, 2 * np.pi, 18)
+    step = 0.8 * 0.8 * RADIUS_PX * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    truth = np.concatenate([place[:18] - step, place[:18] + step, place[18:]])
+    radius = RADIUS_PX * np.concatenate([np.ones(18), np.full(18, 0.6), np.where(np.arange(18) % 2, 1.0, 0.6)])
+    film = film_of_balls((420, 420), truth, radius, depth=DEPTH, sigma_px=1.4, noise_sd=30000 * DEPTH / 30, rng=rng)
     assert_all_are_measured(detect_markers(stored(film), bits=16), truth)
