@@ -19,7 +19,7 @@ LEAST_APART = 0.7  # of the radius: nearer centres cannot be told apart with con
 LEAST_GAIN = 30.0  # twice the log-likelihood that four parameters more must gain
 STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
 _SIZES = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
-_MOST = 40
+_VAIN = 40  # attempts of a film that may fail
 
 
 def split_blobs(
@@ -56,10 +56,14 @@ def split_blobs(
     worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (np.abs(blobs.depth) > 0.4 * depth) & (blobs.explained > 0.6)
     least = LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)
     out: list[BallFits] = []
-    for i in np.nonzero(worth)[0][:_MOST]:
+    tried = 0
+    for i in np.nonzero(worth)[0]:
+        if tried - len(out) == _VAIN:
+            break
         place = blobs.position_px[i]
         if any(np.hypot(*(pair.position_px - place).T).min() < radius for pair in out):
             continue
+        tried += 1
         others = beside()
         whole = fit_group(film, place[None], blobs.radius_px[[i]], optics.sigma_px, optics.mu_px, noise, others)
         if whole.chi2_core[0] <= least:

@@ -27,8 +27,9 @@ _START, _SIZES = 1.4, (0.7, 3.5)  # radii of that ball, relative to the film's: 
 _DEEP = 0.4  # least depth of a place, relative to the film's usual one
 _HOPELESS, _LARGE = 2.0, 1.6  # times the misfit a ball may leave, and the usual radius: one ball more will not mend that
 _SURE = 3.0  # standard deviations
+_ROOM = 6.0  # blur widths between the rims of balls that stand alone
 _DIFFER = 0.04  # of radii and of depths, by which balls of one size and beam do
-_LEFT = 0.3  # of the misfit that a ball may leave, beyond what the film's do
+_LEFT = 0.2  # of the misfit that a ball may leave, beyond what the film's do
 _LINE = 0.61  # of the separation that the second moments suggest of two, where three are in a row
 
 
@@ -62,7 +63,9 @@ def resolve_crowds(
     BallFits
         Those found, and the balls of crowds.
     """
-    known = found.rows(look_clear(found, noise))
+    apart = np.hypot(*(found.position_px[:, None] - found.position_px[None]).transpose(2, 0, 1))
+    alone = (apart < found.radius_px[:, None] + found.radius_px + _ROOM * optics.sigma_px).sum(axis=1) == 1
+    known = found.rows(look_clear(found, noise) & alone)
     if len(known.depth) < LEAST_KNOWN:
         return found
     radius, depth = float(np.median(known.radius_px)), float(np.median(known.depth))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect import Detection, detect_markers
 
-from .films import film_of_balls, grid_of_balls, stored
+from .films import film_of_balls, grid_of_balls, stored, strip
 
 RADIUS_PX, DEPTH = 4.0, 0.3
 
@@ -76,3 +76,18 @@ def test_neighbours_of_two_sizes_that_the_film_has_are_told_apart() -> None:
     radius = RADIUS_PX * np.concatenate([np.ones(18), np.full(18, 0.6), np.where(np.arange(18) % 2, 1.0, 0.6)])
     film = film_of_balls((420, 420), truth, radius, depth=DEPTH, sigma_px=1.4, noise_sd=30000 * DEPTH / 30, rng=rng)
     assert_all_are_measured(detect_markers(stored(film), bits=16), truth)
+
+
+@pytest.mark.parametrize("contrast", [40.0, 15.0])
+def test_bars_as_wide_as_balls_and_deeper_are_no_rows_of_balls(contrast: float) -> None:
+    rng = np.random.default_rng(3)
+    place, _ = grid_of_balls(rng, 7, 60.0, (4.0, 4.0))
+    place = rng.permutation(place)
+    film = film_of_balls((470, 470), place[20:], np.full(29, RADIUS_PX), background=1.0, depth=DEPTH, sigma_px=1.4)
+    for middle in place[:20]:
+        turn, half, width = rng.uniform(0, np.pi), rng.uniform(5.0, 14.0), rng.uniform(5.0, 9.0)
+        along = half * np.array([np.cos(turn), np.sin(turn)])
+        film -= 1.3 * DEPTH * strip(film.shape, middle - along, middle + along, width, 1.4)
+    found = detect_markers(stored(30000 * (film + DEPTH / contrast * rng.standard_normal(film.shape))), bits=16).images
+    gap = np.hypot(*(place[:20, None] - found.position_px[found.shape == "ball"]).transpose(2, 0, 1))
+    assert (gap < 20.0).sum(axis=1).max() < 3
