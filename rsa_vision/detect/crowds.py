@@ -26,7 +26,9 @@ _EXPLAINED = 0.6  # least that one ball explains of what a few make
 _START, _SIZES = 1.4, (0.7, 3.5)  # radii of that ball, relative to the film's: to begin with, and those that count
 _DEEP = 0.4  # least depth of a place, relative to the film's usual one
 _HOPELESS, _LARGE = 2.0, 1.6  # times the misfit a ball may leave, and the usual radius: one ball more will not mend that
+_AROUND = 4.0  # times the variance that is around balls of the film: more is a wire or an edge that goes on
 _SURE = 3.0  # standard deviations
+_TOUCH = 1.1  # sums of two radii, within which one of a crowd has a neighbour
 _ROOM = 6.0  # blur widths between the rims of balls that stand alone
 _DIFFER = 0.04  # of radii and of depths, by which balls of one size and beam do
 _LEFT = 0.2  # of the misfit that a ball may leave, beyond what the film's do
@@ -159,6 +161,8 @@ def _all_balls(fits: BallFits, known: BallFits, noise: NoiseModel) -> bool:
         (left < _LEFT * MISFIT).all()
         and (np.sign(fits.depth) == np.sign(np.median(known.depth))).all()
         and gap.min() > LEAST_APART * fits.radius_px.min()
+        and (gap < _TOUCH * (fits.radius_px[:, None] + fits.radius_px)).any(axis=1).all()
+        and (fits.chi2_ring < _AROUND * max(float(np.median(known.chi2_ring)), 1.0)).all()
         and plausible(fits, noise).all()
         and _among(fits.radius_px, fits.covariance[:, 2, 2], known.radius_px, known.covariance[:, 2, 2]).all()
         and _among(fits.depth, fits.covariance[:, 3, 3], known.depth, known.covariance[:, 3, 3]).all()
