@@ -36,7 +36,7 @@ from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import doubt_of_number, images_beside, resolve_balls
+from rsa_vision.detect.resolve import doubt_of_number, images_beside, lapping_balls, resolve_balls
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
@@ -217,6 +217,7 @@ def _one_polarity(
     keep = left < BENT * MISFIT
     keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
     balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
+    poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
     images = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
     cut_off = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED)) != 0
     trust = np.where(images.flags & MarkerFlag.POOR_FIT, 0.0, np.where(cut_off, _OF_CUT_OFF, 1.0))

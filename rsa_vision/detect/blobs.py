@@ -17,9 +17,9 @@ from rsa_vision.types import Float
 
 LEAST_APART = 0.7  # of the radius: nearer centres cannot be told apart with confidence, and pass for one place
 LEAST_GAIN = 30.0  # twice the log-likelihood that four parameters more must gain
-_STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
+STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
 _SIZES = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
-_MOST = 40
+_VAIN = 40  # attempts of a film that may fail
 
 
 def split_blobs(
@@ -56,16 +56,20 @@ def split_blobs(
     worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (np.abs(blobs.depth) > 0.4 * depth) & (blobs.explained > 0.6)
     least = LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)
     out: list[BallFits] = []
-    for i in np.nonzero(worth)[0][:_MOST]:
+    tried = 0
+    for i in np.nonzero(worth)[0]:
+        if tried - len(out) == _VAIN:
+            break
         place = blobs.position_px[i]
         if any(np.hypot(*(pair.position_px - place).T).min() < radius for pair in out):
             continue
+        tried += 1
         others = beside()
         whole = fit_group(film, place[None], blobs.radius_px[[i]], optics.sigma_px, optics.mu_px, noise, others)
         if whole.chi2_core[0] <= least:
             continue  # even two that left nothing would not be better by enough
-        axis = _long_axis(film, whole, np.sign(blobs.depth[i]))
-        for stretch in _STRETCH:
+        axis = long_axis(film, whole, np.sign(blobs.depth[i]))
+        for stretch in STRETCH:
             starts = whole.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
             pair = fit_group(film, starts, np.full(2, radius), optics.sigma_px, optics.mu_px, noise, others)
             if _two(pair, whole, radius, depth, least, noise):
@@ -84,7 +88,7 @@ def _two(pair: BallFits, whole: BallFits, radius: float, depth: float, least: fl
     return bool(apart > LEAST_APART * radius and alike.all() and one_sign and held and better and plausible(pair, noise).all())
 
 
-def _long_axis(film: NDArray[Any], blob: BallFits, sign: float) -> Float:
+def long_axis(film: NDArray[Any], blob: BallFits, sign: float) -> Float:
     """Vector along a blob from the centre of one ball to that of the other, by the second moments of what lies over the background."""
     centre = blob.position_px[0]
     reach = int(np.ceil(2.2 * blob.radius_px[0] + 2))

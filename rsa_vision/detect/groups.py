@@ -64,17 +64,17 @@ def fit_group(
         One row a ball; figures of merit are taken under the ball, with all balls modelled.
     """
     k = len(start_px)
-    window = _window(film, start_px, start_radius_px, sigma_px, noise, others)
+    window = window_around(film, start_px, start_radius_px, sigma_px, noise, others)
     size, cols, rows, valid, data = window.size, window.cols, window.rows, window.valid, window.raw - window.neighbours
     local, radius = start_px - window.corner_px, np.clip(start_radius_px, RADIUS_PX[0], RADIUS_PX[1]).astype(np.float64)
     low, high = max(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20 * sigma_px)
     surface = window.surface
     weight = valid / noise.variance_at(window.raw)
-    images = _images(window, surface, local, radius, sigma_px, mu_px)
+    images = images_in(window, surface, local, radius, sigma_px, mu_px)
     theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     if edge:
         surface = np.column_stack([surface, edge_profile(data - images.value.T @ theta[:k], valid, sigma_px)])
-        images = _images(window, surface, local, radius, sigma_px, mu_px)
+        images = images_in(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     ground: Float | None = None
     converged, before = False, np.zeros((3, k))
@@ -100,7 +100,7 @@ def fit_group(
             if step in _LOOKED_AGAIN:
                 bare = data - images.linear[:, :k] @ theta[:k] - images.of_ground(theta)
                 surface = np.column_stack([window.surface, edge_profile(bare, valid, sigma_px, bent=bent)])
-        images = _images(window, surface, local, radius, sigma_px, mu_px, ground)
+        images = images_in(window, surface, local, radius, sigma_px, mu_px, ground)
         theta = weighted_least_squares(images.linear, weight, data, 1e-9)
     root = np.sqrt(weight)[:, None]
     estimator = _estimator(jac * root, size, noise)[: 4 * k]
@@ -163,10 +163,10 @@ def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float,
     float
         As if the noise were white.
     """
-    window = _window(film, fits.position_px, fits.radius_px, sigma_px, noise, others)
+    window = window_around(film, fits.position_px, fits.radius_px, sigma_px, noise, others)
     weight = window.valid / noise.variance_at(window.raw)
     data = window.raw - window.neighbours
-    images = _images(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, sigma_px, mu_px)
+    images = images_in(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, sigma_px, mu_px)
     theta = weighted_least_squares(images.linear, weight, data)
     edge = edge_profile(data - images.value.T @ theta[: len(fits.depth)], window.valid, sigma_px)
     residual, jac = data - images.linear @ theta, columns([images.jacobian(theta).T, edge.T])
@@ -175,7 +175,7 @@ def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float,
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Window:
+class GroupWindow:
     """The pixels around a group, in one row each: (n,) unless said otherwise."""
 
     size: int
@@ -188,7 +188,8 @@ class _Window:
     surface: Float  # (n, 6)
 
 
-def _window(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: float, noise: NoiseModel, others: Any) -> _Window:
+def window_around(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: float, noise: NoiseModel, others: Any) -> GroupWindow:
+    """Cut the window that balls at these places need, with the images of neighbours as of :func:`fit_group`."""
     middle = at_px.mean(0)
     half = half_size(float(radius_px.max()), sigma_px) + int(np.ceil(float(np.abs(at_px - middle).max())))
     patch = cut(film, middle[None], half, noise)
@@ -197,11 +198,11 @@ def _window(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: float,
     raw = patch.values[0].ravel()
     neighbours = np.zeros_like(raw) if others is None else others(cols + corner[0], rows + corner[1])
     valid = patch.valid[0].ravel().astype(np.float64)
-    return _Window(patch.size, corner, cols, rows, raw, neighbours, valid, polynomial(half, cols - half, rows - half))
+    return GroupWindow(patch.size, corner, cols, rows, raw, neighbours, valid, polynomial(half, cols - half, rows - half))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Images:
+class GroupImages:
     """What balls at given places look like in a window, with all that enters it linearly."""
 
     value: Float  # (k, n)
@@ -239,9 +240,10 @@ def _under(value: Float, background: Float) -> Float:
     return np.asarray(apart / max(float(np.abs(apart).max()), 1e-9))
 
 
-def _images(
-    window: _Window, surface: Float, local: Float, radius: Float, sigma_px: float, mu_px: float, ground: Float | None = None
-) -> _Images:
+def images_in(
+    window: GroupWindow, surface: Float, local: Float, radius: Float, sigma_px: float, mu_px: float, ground: Float | None = None
+) -> GroupImages:
+    """Draw balls at places (k, 2) in a window; ``ground``: what is under them and they take their part of."""
     dx, dy = window.cols - local[:, :1], window.rows - local[:, 1:]
     rho = np.hypot(dx, dy)
     value, slope, slope_r = ball_table(round(mu_px * sigma_px, 3)).evaluate(rho / sigma_px, radius / sigma_px)
@@ -256,7 +258,7 @@ def _images(
             pairs, products, of_pairs = [*pairs, pair], [*products, product[None]], [*of_pairs, by]
     # a mark takes away its part of what is there: on linear films more beside an implant than behind it, on films of density as much
     linear = columns([value, surface.T, *([] if ground is None else [ground * value]), *products])
-    return _Images(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, ground, pairs, of_pairs)
+    return GroupImages(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, ground, pairs, of_pairs)
 
 
 def edge_profile(bare: Float, valid: Float, sigma_px: float, *, bent: bool = False) -> Float:

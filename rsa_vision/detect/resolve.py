@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
+from rsa_vision.detect.crowds import resolve_crowds
 from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear, of_size
 from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import edge_gain, fit_group
@@ -70,7 +71,7 @@ def resolve_balls(
     fits : BallFits
         Those that are balls.
     touching : ndarray of bool, shape (n,)
-        Fitted together with a neighbour.
+        Fitted together with a neighbour, or perhaps two.
     edged : ndarray of bool, shape (n,)
         Fitted together with an edge.
     drawn : ndarray of bool, shape (n,)
@@ -86,7 +87,7 @@ def resolve_balls(
     others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-    drawn, spot = find_spot(film, single.rows(~clean), single.rows(clean & look_clear(single, noise)), optics, noise, others)
+    drawn, spot, in_doubt = find_spot(film, single.rows(~clean), single.rows(clean & look_clear(single, noise)), optics, noise, others)
     if spot is not None:
         rest = ~_taken(single, drawn)
         single, clean, tees = single.rows(rest), clean[rest], with_spot(tees, drawn, spot, optics)
@@ -114,8 +115,8 @@ def resolve_balls(
     for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
         index = np.array(g)
         if 1 < len(g) <= _MOST_IN_GROUP:
-            beside = _beside(known, index, optics, tees)
-            fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, beside))
+            near = _beside(known, index, optics, tees)
+            fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, near))
         elif len(g) > _MOST_IN_GROUP:
             fits.append(_peel(film, good.rows(index), optics, noise, tees))
     alone = np.array([g[0] for g in groups if len(g) == 1], dtype=np.intp)
@@ -132,6 +133,15 @@ def resolve_balls(
     alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
     perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
+    found = resolve_crowds(
+        film,
+        candidates,
+        distinct(found, noise),
+        optics,
+        noise,
+        lambda balls, members: _beside(balls, members, optics, tees),
+        lambda at, radius: _deep(film, at, radius, tees),
+    )
     found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
     found, edged = beside_edges(film, distinct(found, noise), optics, noise, tees)
     balls = plausible(found, noise)
@@ -141,6 +151,7 @@ def resolve_balls(
     touching = np.zeros(len(found.depth), bool)
     for g in _groups(found, optics):
         touching[g] = len(g) > 1
+    touching[by_spot] |= in_doubt
     return found, touching, edged, by_spot
 
 
@@ -218,12 +229,12 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
 
 def _in_one_beam(fits: BallFits) -> Bool:
     """Say whose shadow lies over that of another ball."""
-    return np.asarray((_lapping(fits) & ~np.eye(len(fits.depth), dtype=bool)).any(axis=1))
+    return np.asarray((lapping_balls(fits) & ~np.eye(len(fits.depth), dtype=bool)).any(axis=1))
 
 
 def _cancelled(fits: BallFits) -> Bool:
     """Say over which lies one of the other polarity: together they may explain anything."""
-    return np.asarray((_lapping(fits) & (np.sign(fits.depth)[:, None] != np.sign(fits.depth))).any(axis=1))
+    return np.asarray((lapping_balls(fits) & (np.sign(fits.depth)[:, None] != np.sign(fits.depth))).any(axis=1))
 
 
 def doubt_of_number(fits: BallFits) -> Float:
@@ -243,7 +254,7 @@ def doubt_of_number(fits: BallFits) -> Float:
     out = np.zeros((len(fits.depth), 2, 2))
     if len(out) == 0:
         return out
-    lapping: Any = _lapping(fits)
+    lapping: Any = lapping_balls(fits)
     _, label = connected_components(csr_array(lapping), directed=False)
     for k in np.flatnonzero(np.bincount(label) > 2):
         members = np.flatnonzero(label == k)
@@ -255,7 +266,8 @@ def doubt_of_number(fits: BallFits) -> Float:
     return out
 
 
-def _lapping(fits: BallFits) -> Bool:
+def lapping_balls(fits: BallFits) -> Bool:
+    """Say whose shadows lie over each other, shape (n, n); each over its own."""
     gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
     return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
 

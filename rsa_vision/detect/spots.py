@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, slopes, uneven, uneven_white
+from rsa_vision.detect.blobs import LEAST_GAIN
 from rsa_vision.detect.decide import LEAST_KNOWN, SURE, over_clutter
+from rsa_vision.detect.double_images import gain_over_two
 from rsa_vision.detect.find import DOUBTFUL, MISFIT, misfit, plausible
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
@@ -85,7 +87,7 @@ class _State:
 
 def find_spot(
     film: NDArray[Any], odd: BallFits, sure: BallFits, optics: Optics, noise: NoiseModel, others: Any
-) -> tuple[BallFits, Spot | None]:
+) -> tuple[BallFits, Spot | None, Bool]:
     """Find the spot that explains odd images, and fit the balls that it explains.
 
     Parameters
@@ -105,8 +107,10 @@ def find_spot(
     fits : BallFits
         None of them where fewer than :data:`COMPANY` are explained.
     spot : Spot or None
+    doubtful : ndarray of bool, shape (n,)
+        Two balls of the film's own explain these nearly as well: their covariances hold both.
     """
-    none = odd.rows(slice(0))
+    none, nobody = odd.rows(slice(0)), np.zeros(0, bool)
     worth = (
         (odd.explained > _EXPLAINED)
         & (over_clutter(odd) > SURE)
@@ -117,13 +121,13 @@ def find_spot(
     odd = odd.rows(worth)
     # tantalum, not bone, and those with most company of their size
     if len(odd.depth) < COMPANY:
-        return none, None
+        return none, None, nobody
     depth = np.abs(odd.depth)
     usual = np.median(np.abs(sure.depth)) if len(sure.depth) >= LEAST_KNOWN else np.sort(depth)[-COMPANY]
     odd = odd.rows(depth > _FAINT * usual)
     like = np.abs(np.log(odd.radius_px[:, None] / odd.radius_px)) < np.log(_LIKE)
     if like.sum(axis=1).max(initial=0) < COMPANY:
-        return none, None
+        return none, None, nobody
     odd = odd.rows(like[like.sum(axis=1).argmax()])
     odd = odd.rows(np.argsort(-over_clutter(odd)))
     radius = float(np.median(odd.radius_px))
@@ -137,12 +141,28 @@ def find_spot(
     window = _window(film, odd, half, others, noise)
     state, _ = _fitted(window, _start(odd, window, best.along), _LAST_STEPS, optics, noise, radius)
     if abs(state.along[2]) < _ACROSS * np.hypot(*state.along[:2]):
-        return none, None
+        return none, None, nobody
     fits = _table(window, state, odd, optics, noise)
     rest, before = misfit(fits, noise), misfit(odd, noise)
     alike = np.abs(np.log(fits.radius_px / np.median(fits.radius_px))) < np.log(_LIKE)  # others are at another height
     kept = alike & plausible(fits, noise) & (rest < np.maximum(DOUBTFUL * MISFIT, _BETTER * before))
-    return (fits.rows(kept), spot_of(state.along)) if np.count_nonzero(kept & (rest < _BETTER * before)) >= COMPANY else (none, None)
+    if np.count_nonzero(kept & (rest < _BETTER * before)) < COMPANY:
+        return none, None, nobody
+    spot, better = spot_of(state.along), (rest < _BETTER * before)[kept]
+    fits, odd = fits.rows(kept), odd.rows(kept)
+
+    def image(i: int, cols: Float, rows: Float) -> Float:
+        dx, dy = (axis[None] - middle for axis, middle in zip((cols, rows), fits.position_px[i], strict=True))
+        return np.asarray(spot_image(spot, dx, dy, fits.radius_px[[i]], optics)[0])
+
+    gain, apart = gain_over_two(film, fits, image, odd, sure, optics, noise, others)
+    if np.count_nonzero(better & (gain > LEAST_GAIN)) < COMPANY:
+        return none, None, nobody
+    doubtful = gain < LEAST_GAIN
+    covariance = fits.covariance.copy()
+    covariance[doubtful, :2, :2] += apart[doubtful, :, None] * apart[doubtful, None]
+    may_be = gain > -LEAST_GAIN
+    return replace(fits, covariance=covariance).rows(may_be), spot, doubtful[may_be]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
