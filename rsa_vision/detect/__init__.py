@@ -154,7 +154,9 @@ def _polarities(
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
-            optics[sign], balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
+            of_pins, balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
+            if balls > 0 or not (np.sign(seeds.depth) == sign).any():  # else even one faint ball knows more of its blur than nobody
+                optics[sign] = of_pins
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rsa_vision.detect.balls import RADIUS_PX, BallFits
-from rsa_vision.detect.find import EXPLAINED, MISFIT, misfit
+from rsa_vision.detect.find import CHANCE, EXPLAINED, MISFIT, misfit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float
 
@@ -91,7 +91,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     if len(radii) < LEAST_KNOWN:
         # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
         company = _of_like_spread(_spread(fits, sigma_px), sure) >= _COMPANY
-        return np.asarray(sure & (company | (close & (strength > ALONE))))
+        as_close = misfit(fits, noise, CHANCE) < MISFIT
+        return np.asarray(sure & (company | (as_close & (strength > ALONE))))
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
     least = np.where(close, FAINT, UNEXCUSED)
