@@ -49,14 +49,14 @@ __all__ = ["Detection", "detect_markers"]
 
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
-WHOLE = 0.999  # part of the pixels under a ball
+WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 BENT = 1.5  # the same once an edge or bending surfaces around it could have taken it up
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _CAP = 50.0  # significance beyond which a needle is no better evidence
-_OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is saturated: plateaus have rims as well
+_OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
@@ -219,10 +219,7 @@ def _one_polarity(
     keep = left < BENT * MISFIT
     keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
     balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
-    images = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
-    cut_off = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED)) != 0
-    trust = np.where(images.flags & MarkerFlag.POOR_FIT, 0.0, np.where(cut_off, _OF_CUT_OFF, 1.0))
-    evidence = float(trust @ np.minimum(images.snr, _CAP))
+    images, evidence = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
     return evidence, Detection(images, sign < 0, optics, noise)
 
 
@@ -275,8 +272,8 @@ def _table(
     tees: list[NeedleFit],
     optics: Optics,
     noise: NoiseModel,
-) -> MarkerImages:
-    """Put balls and tees into one table, film order (row by row), with flags.
+) -> tuple[MarkerImages, float]:
+    """Put balls and tees into one table, film order (row by row), with flags; return the evidence for marks as well.
 
     ``usual`` is the noise under balls, ``ratio`` what :func:`rsa_vision.detect.settle.settle` says of their surroundings.
     """
@@ -303,7 +300,7 @@ def _table(
     flags[edge] |= MarkerFlag.EDGE
     valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in tees]])
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
-    flags[valid < 0.8] |= MarkerFlag.CLIPPED
+    flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
     poor = np.concatenate([poor_ball, np.array([t.misfit for t in tees]) > DOUBTFUL * MISFIT])
     flags[poor] |= MarkerFlag.POOR_FIT
@@ -317,7 +314,8 @@ def _table(
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
-    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1]))))
+    trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(snr, _CAP))
 
 
 def _excess(fit: NeedleFit, noise: NoiseModel) -> float:

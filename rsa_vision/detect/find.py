@@ -21,6 +21,7 @@ _LIKE = 1.25  # ratio of their sizes
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
+_COARSE_BLUR = 0.25  # of the radius that answers, where that is more: between the sharpest and the softest images there are
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
 DOUBTFUL = 0.6  # of it: more may be two balls, or something else
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
@@ -157,8 +158,13 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
     """
     if len(candidates.radius_px) == 0:
         return _no_fits()
-    guess = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
-    fits = fit_at(film, candidates.position_px, candidates.radius_px, guess, noise, quick=True, sparse=True)
+    sizes, size = np.unique(candidates.radius_px, return_inverse=True)
+    parts = []
+    for k, radius in enumerate(sizes):
+        sigma = max(COARSE_SIGMA_PX, _COARSE_BLUR * float(radius))
+        guess, same = Optics(sigma, COARSE_MU_PX * COARSE_SIGMA_PX / sigma), size == k
+        parts.append(fit_at(film, candidates.position_px[same], candidates.radius_px[same], guess, noise, quick=True, sparse=True))
+    fits = join(parts).rows(np.argsort(np.argsort(size, kind="stable")))
     return fits.rows(plausible(fits, noise, slack=2.5))
 
 

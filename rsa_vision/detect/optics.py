@@ -29,6 +29,8 @@ _SHORTER = 3  # attempts at a step that gains
 _ODD = 6.0  # three times what the two numbers of the optics gain by chance
 _SETTLED = 0.3  # standard deviations
 _MOST_TRIED, _MOST_SEEDS = 40, 40
+_WHOLE, _PARTLY = 0.98, 0.8  # of the pixels under a ball
+_SPECKS = 0.5  # of the capped significance of the best
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
 _CAP = 50.0  # significance beyond which a ball is no better evidence
@@ -59,8 +61,11 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     """
     if len(seeds.depth) == 0:
         return Optics(COARSE_SIGMA_PX, COARSE_MU_PX), 0.0
-    clear = seeds.rows((seeds.valid_fraction > 0.98) & (seeds.window_fraction > 0.8))
-    seeds = clear if len(clear.depth) else seeds
+    # those that are whole tell most; not where they are specks beside balls of which noise or saturation takes a part
+    strength, inside = np.minimum(seeds.significance, _CAP), seeds.window_fraction > 0.8
+    clear, partly = (inside & (seeds.valid_fraction > least) for least in (_WHOLE, _PARTLY))
+    if partly.any():
+        seeds = seeds.rows(clear if strength[clear].max(initial=0.0) > _SPECKS * strength[partly].max() else partly)
     best = np.argsort(_closeness(seeds, noise))[:_MOST_TRIED]
     position, radius = seeds.position_px[best], seeds.radius_px[best]
 
