@@ -32,7 +32,7 @@ from rsa_vision.detect.leftover import noise_under
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
-from rsa_vision.detect.optics import ball_evidence, estimate_optics
+from rsa_vision.detect.optics import ball_evidence, estimate_optics, first_noise_under
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
@@ -107,8 +107,8 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     pins = look_for_pins(values, candidates.strokes, noise)
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
-        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, noise, limit)
-        for sign, optics in _polarities(values, signs, seeds, pins, candidates, noise)
+        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, of_marks, limit)
+        for sign, optics, of_marks in _polarities(values, signs, seeds, pins, candidates, noise)
     ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
@@ -144,24 +144,26 @@ def _of_tees(candidates: Candidates, sign: int) -> float:
 
 def _polarities(
     film: NDArray[Any], signs: list[int], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
-) -> list[tuple[int, Optics]]:
-    """Signs of depth worth looking at, with their optics; both only where neither is clearly the markers'."""
-    weight, optics = {-1: 0.0, 1: 0.0}, {}
+) -> list[tuple[int, Optics, NoiseModel]]:
+    """Signs of depth worth looking at, with their optics and noise; both only where neither is clearly the markers'."""
+    weight, optics, noises = {-1: 0.0, 1: 0.0}, {}, {}
     for sign in signs:
-        optics[sign], balls = estimate_optics(film, seeds.rows(np.sign(seeds.depth) == sign), noise)
+        mine = seeds.rows(np.sign(seeds.depth) == sign)
+        noises[sign] = replace(noise, under=first_noise_under(film, mine, noise))
+        optics[sign], balls = estimate_optics(film, mine, noises[sign])
         strength = -sign * candidates.junctions[:, 4]
         clear = strength > CLEAR_JUNCTION
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
             of_pins, balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
-            if balls > 0 or not (np.sign(seeds.depth) == sign).any():  # else even one faint ball knows more of its blur than nobody
+            if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
                 optics[sign] = of_pins
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():
         return []
-    return [(sign, optics[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
+    return [(sign, optics[sign], noises[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
 
 
 def _one_polarity(
@@ -256,8 +258,8 @@ def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
 
 def _what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Float, Bool]:
     """Return the misfit of each ball, and which are not described well."""
-    under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
-    left = misfit(under, noise, CHANCE)
+    under = replace(balls, chi2_core=balls.chi2_core / max(usual, noise.under))  # noise that all balls have under them is no misfit of one
+    left = misfit(under, replace(noise, under=1.0), CHANCE)
     return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE)
 
 
