@@ -27,6 +27,7 @@ DOUBTFUL = 0.6  # of it: more may be two balls, or something else
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
 PROMISING = 0.75  # of the significance a mark must have: a quick fit may be so far off
+CLEAR = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
 
@@ -174,8 +175,9 @@ def guessed_optics(radius_px: float) -> Optics:
 
 
 def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:
-    """Of fits that fell on the same place keep the better one (best first)."""
-    order = np.argsort(misfit(fits, noise) + (1 - fits.explained))
+    """Of fits that fell on the same place keep the better one (best first); specks of a few pixels fit well, but come after what is sure."""
+    speck = fits.significance < CLEAR * np.sqrt(np.maximum(fits.chi2_ring, 1.0))
+    order = np.lexsort((misfit(fits, noise) + (1 - fits.explained), speck))
     keep: list[int] = []
     for i in order:
         gap = np.hypot(*(fits.position_px[keep] - fits.position_px[i]).T) if keep else np.zeros(0)
