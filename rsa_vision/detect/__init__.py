@@ -161,7 +161,7 @@ def _polarities(
                 optics[sign] = of_pins
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
-    if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():
+    if weight[best] == 0 and len(seeds.depth) == 0:
         return []
     return [(sign, optics[sign], noises[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
 

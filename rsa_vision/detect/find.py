@@ -175,7 +175,7 @@ def guessed_optics(radius_px: float) -> Optics:
 
 
 def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:
-    """Of fits that fell on the same place keep the better one (best first); specks of a few pixels fit well, but come after what is sure."""
+    """Of fits that fell on the same place keep the better one (best first); what is sure comes before specks, which fit well."""
     speck = fits.significance < CLEAR * np.sqrt(np.maximum(fits.chi2_ring, 1.0))
     order = np.lexsort((misfit(fits, noise) + (1 - fits.explained), speck))
     keep: list[int] = []

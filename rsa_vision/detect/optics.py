@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import BallFits, ball_image, slopes
-from rsa_vision.detect.decide import LEAST_KNOWN, SURE, over_clutter
+from rsa_vision.detect.decide import SURE, over_clutter
 from rsa_vision.detect.find import (
     COARSE_MU_PX,
     COARSE_SIGMA_PX,
@@ -110,9 +110,6 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     clear, partly = (inside & (seeds.valid_fraction > least) for least in (_WHOLE, _PARTLY))
     if partly.any():
         seeds = seeds.rows(clear if strength[clear].max(initial=0.0) > _SPECKS * strength[partly].max() else partly)
-    # a speck of few pixels is soon like any ball
-    sure = over_clutter(seeds) > SURE * np.sqrt(noise.gain(np.hypot(COARSE_SIGMA_PX, 0.5 * seeds.radius_px)))
-    seeds = seeds.rows(sure) if np.count_nonzero(sure) >= LEAST_KNOWN else seeds
     best = np.argsort(_closeness(seeds, noise))[:_MOST_TRIED]
     position, radius = seeds.position_px[best], seeds.radius_px[best]
 
