@@ -11,7 +11,6 @@ from rsa_vision.types import Bool, Float
 
 SURE = CLEAR
 ALONE = 10.0  # the same for marks of which there are not enough to tell what they are like
-_BY_CHANCE = 2.5  # standard deviations of the mean square of noise that a hundredth of them leaves
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
 _LOST = 0.75  # of that, below which a first fit is too low for a mark
@@ -90,11 +89,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     pattern = _not_faint(sure & close & (fits.explained > CLOSE), height)
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < LEAST_KNOWN:
-        # noise hides what marks are like here: those that have no company have to be clearer
+        # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
         company = _of_like_spread(_spread(fits, sigma_px), sure) >= _COMPANY
-        # and it is an excuse for what they leave only where there is nothing but noise around
-        plain = fits.chi2_ring < 1 + noise.scatter(fits.n_core)
-        close |= plain & (misfit(fits, noise, _BY_CHANCE) < MISFIT)
         return np.asarray(sure & (company | (close & (strength > ALONE))))
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
