@@ -32,7 +32,7 @@ from rsa_vision.detect.leftover import noise_under
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
-from rsa_vision.detect.optics import ball_evidence, estimate_optics
+from rsa_vision.detect.optics import ball_evidence, estimate_optics, first_noise_under
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
@@ -49,14 +49,14 @@ __all__ = ["Detection", "detect_markers"]
 
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
-WHOLE = 0.999  # part of the pixels under a ball
+WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 BENT = 1.5  # the same once an edge or bending surfaces around it could have taken it up
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _CAP = 50.0  # significance beyond which a needle is no better evidence
-_OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is saturated: plateaus have rims as well
+_OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
@@ -107,8 +107,8 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     pins = look_for_pins(values, candidates.strokes, noise)
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
-        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, noise, limit)
-        for sign, optics in _polarities(values, signs, seeds, pins, candidates, noise)
+        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, of_marks, limit)
+        for sign, optics, of_marks in _polarities(values, signs, seeds, pins, candidates, noise)
     ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
@@ -144,22 +144,26 @@ def _of_tees(candidates: Candidates, sign: int) -> float:
 
 def _polarities(
     film: NDArray[Any], signs: list[int], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
-) -> list[tuple[int, Optics]]:
-    """Signs of depth worth looking at, with their optics; both only where neither is clearly the markers'."""
-    weight, optics = {-1: 0.0, 1: 0.0}, {}
+) -> list[tuple[int, Optics, NoiseModel]]:
+    """Signs of depth worth looking at, with their optics and noise; both only where neither is clearly the markers'."""
+    weight, optics, noises = {-1: 0.0, 1: 0.0}, {}, {}
     for sign in signs:
-        optics[sign], balls = estimate_optics(film, seeds.rows(np.sign(seeds.depth) == sign), noise)
+        mine = seeds.rows(np.sign(seeds.depth) == sign)
+        noises[sign] = replace(noise, under=first_noise_under(film, mine, noise))
+        optics[sign], balls = estimate_optics(film, mine, noises[sign])
         strength = -sign * candidates.junctions[:, 4]
         clear = strength > CLEAR_JUNCTION
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
-            optics[sign], balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
+            of_pins, balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
+            if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
+                optics[sign] = of_pins
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
-    if weight[best] == 0 and not (np.sign(seeds.depth) == best).any():
+    if weight[best] == 0 and len(seeds.depth) == 0:
         return []
-    return [(sign, optics[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
+    return [(sign, optics[sign], noises[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
 
 
 def _one_polarity(
@@ -218,10 +222,7 @@ def _one_polarity(
     keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
     balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
-    images = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
-    cut_off = (images.flags & (MarkerFlag.SATURATED | MarkerFlag.CLIPPED)) != 0
-    trust = np.where(images.flags & MarkerFlag.POOR_FIT, 0.0, np.where(cut_off, _OF_CUT_OFF, 1.0))
-    evidence = float(trust @ np.minimum(images.snr, _CAP))
+    images, evidence = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
     return evidence, Detection(images, sign < 0, optics, noise)
 
 
@@ -258,8 +259,8 @@ def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
 
 def _what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Float, Bool]:
     """Return the misfit of each ball, and which are not described well."""
-    under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
-    left = misfit(under, noise, CHANCE)
+    under = replace(balls, chi2_core=balls.chi2_core / max(usual, noise.under))  # noise that all balls have under them is no misfit of one
+    left = misfit(under, replace(noise, under=1.0), CHANCE)
     return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE)
 
 
@@ -274,8 +275,8 @@ def _table(
     tees: list[NeedleFit],
     optics: Optics,
     noise: NoiseModel,
-) -> MarkerImages:
-    """Put balls and tees into one table, film order (row by row), with flags.
+) -> tuple[MarkerImages, float]:
+    """Put balls and tees into one table, film order (row by row), with flags; return the evidence for marks as well.
 
     ``usual`` is the noise under balls, ``ratio`` what :func:`rsa_vision.detect.settle.settle` says of their surroundings.
     """
@@ -302,7 +303,7 @@ def _table(
     flags[edge] |= MarkerFlag.EDGE
     valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in tees]])
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
-    flags[valid < 0.8] |= MarkerFlag.CLIPPED
+    flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
     poor = np.concatenate([poor_ball, np.array([t.misfit for t in tees]) > DOUBTFUL * MISFIT])
     flags[poor] |= MarkerFlag.POOR_FIT
@@ -316,7 +317,8 @@ def _table(
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
-    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1]))))
+    trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(snr, _CAP))
 
 
 def _excess(fit: NeedleFit, noise: NoiseModel) -> float:

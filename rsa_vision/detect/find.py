@@ -22,11 +22,13 @@ _LIKE = 1.25  # ratio of their sizes
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
+_COARSE_BLUR = 0.25  # of the radius that answers, where that is more: between the sharpest and the softest images there are
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
 DOUBTFUL = 0.6  # of it: more may be two balls, or something else
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
 PROMISING = 0.75  # of the significance a mark must have: a quick fit may be so far off
+CLEAR = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
 
@@ -85,8 +87,8 @@ def misfit(fits: BallFits, noise: NoiseModel, chance: float = 0.0) -> Float:
 
     ``chance``: what is within so many standard deviations of the mean square of noise alone does not count.
     """
-    excess = np.maximum(fits.chi2_core - 1.0, 0.0)
-    excess = np.where(excess > chance * noise.scatter(fits.n_core), excess, 0.0) * noise.variance_at(fits.background)
+    excess = np.maximum(fits.chi2_core - noise.under, 0.0)
+    excess = np.where(excess > chance * noise.under * noise.scatter(fits.n_core), excess, 0.0) * noise.variance_at(fits.background)
     rest: Float = np.sqrt(excess) / np.maximum(np.abs(fits.depth), 1e-9)
     return rest
 
@@ -111,7 +113,7 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
     least = 1 - (1 - EXPLAINED) * slack
     stands_out = fits.significance / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
-    explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
+    explained = (fits.explained > least) | ((explained_over_noise(fits, noise.under) > least) & stands_out)
     return usable & (misfit(fits, noise, CHANCE) < MISFIT * slack) & explained & (fits.significance > 5.0)
 
 
@@ -134,12 +136,12 @@ def promising(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     return np.asarray(fits.significance > PROMISING * limit * np.sqrt(noise.gain(np.hypot(sigma_px, 0.5 * fits.radius_px))))
 
 
-def explained_over_noise(fits: BallFits) -> Float:
-    """Return the part of the excess over the noise under each ball that the ball explains, shape (n,)."""
+def explained_over_noise(fits: BallFits, under: float) -> Float:
+    """Return the part of the excess over the noise under each ball (in units of that beside it) that the ball explains, shape (n,)."""
     left = fits.chi2_core
     raised = left / np.maximum(1.0 - fits.explained, 1e-9)
-    out: Float = 1.0 - np.maximum(left - 1.0, 0.0) / np.maximum(raised - 1.0, 1e-9)
-    return np.where(raised > 1.0, out, 0.0)
+    out: Float = 1.0 - np.maximum(left - under, 0.0) / np.maximum(raised - under, 1e-9)
+    return np.where(raised > under, out, 0.0)
 
 
 def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) -> BallFits:
@@ -158,17 +160,28 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
     """
     if len(candidates.radius_px) == 0:
         return _no_fits()
-    guess = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
-    fits = fit_at(film, candidates.position_px, candidates.radius_px, guess, noise, quick=True, sparse=True)
+    sizes, size = np.unique(candidates.radius_px, return_inverse=True)
+    parts = []
+    for k, radius in enumerate(sizes):
+        same, guess = size == k, guessed_optics(float(radius))
+        parts.append(fit_at(film, candidates.position_px[same], candidates.radius_px[same], guess, noise, quick=True, sparse=True))
+    fits = join(parts).rows(np.argsort(np.argsort(size, kind="stable")))
     return fits.rows(plausible(fits, noise, slack=2.5))
 
 
+def guessed_optics(radius_px: float) -> Optics:
+    """Return what balls of this size may look like, before a film's own are known."""
+    sigma = max(COARSE_SIGMA_PX, _COARSE_BLUR * radius_px)
+    return Optics(sigma, COARSE_MU_PX * COARSE_SIGMA_PX / sigma)
+
+
 def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:
-    """Of fits that fell on the same place keep the better one (best first)."""
+    """Of fits that fell on the same place keep the better one (best first); what is sure comes before specks, which fit well."""
     if len(fits.depth) == 0:
         return fits
     near = KDTree(fits.position_px).query_ball_point(fits.position_px, 0.5 * fits.radius_px)
-    order, kept = np.argsort(misfit(fits, noise) + (1 - fits.explained)), np.zeros(len(near), bool)
+    speck = fits.significance < CLEAR * np.sqrt(np.maximum(fits.chi2_ring, 1.0))
+    order, kept = np.lexsort((misfit(fits, noise) + (1 - fits.explained), speck)), np.zeros(len(near), bool)
     for i in order:
         kept[i] = not kept[near[i]].any()
     return fits.rows(order[kept[order]])

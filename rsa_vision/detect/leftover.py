@@ -43,7 +43,8 @@ def noise_under(uneven: Float, radius_px: Float, quiet: float, places: list[Plac
     if len(uneven) < LEAST:
         return 1.0
     usual_half = half_size(float(np.median(radius_px)), optics.sigma_px)
-    left = [_uneven(these, float(np.median(radius_px)), quiet, optics, noise) for these in places if abs(these.half - usual_half) <= 1]
+    near = [these for these in places if abs(these.half - usual_half) <= 1 and len(these.values)]  # a crowded film has none
+    left = [_uneven(these, float(np.median(radius_px)), quiet, optics, noise) for these in near]
     beside = np.concatenate([np.zeros(0), *left])
     if len(beside) < LEAST:
         return 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -42,6 +42,8 @@ class NoiseModel:
         Correlation of pixels at (row, col) offsets -LAGS..LAGS; 1 in the middle.
     floor, ceiling : float
         Values at or beyond them are saturated and carry no information.
+    under : float
+        Variance under marks, in units of that beside them, where more is known than the curve tells.
     """
 
     level: Float
@@ -49,6 +51,7 @@ class NoiseModel:
     correlation: Float
     floor: float
     ceiling: float
+    under: float = 1.0
 
     def variance_at(self, values: Float) -> Float:
         """Return the variance of pixels with these expected values (same shape)."""
@@ -67,6 +70,10 @@ class NoiseModel:
         lag = np.arange(-LAGS, LAGS + 1)
         shared = np.exp(-(lag[:, None] ** 2 + lag**2) / (4 * np.square(spread_px)[..., None, None]))  # autocorrelation of the Gaussian
         return np.asarray((shared * self.correlation).sum((-2, -1)))
+
+    def as_white(self) -> NoiseModel:
+        """Return the same noise as if that of neighbouring pixels were independent."""
+        return replace(self, correlation=_lag_zero())
 
     @property
     def is_white(self) -> bool:

@@ -10,7 +10,18 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import BallFits, ball_image, slopes
-from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT, fit_at, misfit, refine
+from rsa_vision.detect.decide import SURE, over_clutter
+from rsa_vision.detect.find import (
+    COARSE_MU_PX,
+    COARSE_SIGMA_PX,
+    DOUBTFUL,
+    EXPLAINED,
+    MISFIT,
+    fit_at,
+    guessed_optics,
+    misfit,
+    refine,
+)
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
@@ -29,8 +40,12 @@ _SHORTER = 3  # attempts at a step that gains
 _ODD = 6.0  # three times what the two numbers of the optics gain by chance
 _SETTLED = 0.3  # standard deviations
 _MOST_TRIED, _MOST_SEEDS = 40, 40
+_WHOLE, _PARTLY, _INSIDE = 0.98, 0.8, 0.8  # of the pixels under a ball, and of its window
+_SPECKS = 0.5  # of the capped significance of the best
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
+_ENOUGH, _ASKED = 8, 24  # sure candidates that tell the noise under marks; more are not asked
+_MORE, _MOST = 1.3, 4.0  # variance under them that is looked into, and that they may tell
 _CAP = 50.0  # significance beyond which a ball is no better evidence
 
 
@@ -39,6 +54,37 @@ def ball_evidence(fits: BallFits, noise: NoiseModel) -> float:
     rest = np.maximum(misfit(fits, noise) / MISFIT, (1 - fits.explained) / (1 - EXPLAINED))
     whole = (fits.valid_fraction > 0.95) & (fits.window_fraction > 0.8)
     return float((np.minimum(fits.significance, _CAP) * np.exp(-((rest / _SHARP) ** 2)))[whole].sum())
+
+
+def first_noise_under(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> float:
+    """Return the variance under marks in units of that beside them, as the film's sure candidates tell it before its optics are known.
+
+    Where a film records the logarithm of the exposure, or anything as steep, the fewer quanta under marks make more noise than there is at
+    any background: large balls are as unlike their models then as what is no ball. Only the odd part of what fits leave counts, of which
+    a wrong blur has none, over that of the structure around; and the lower quartile, since what is no ball leaves more.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    seeds : BallFits
+        Of one polarity.
+    noise : NoiseModel
+
+    Returns
+    -------
+    float
+        One where too few tell, where there is less, and where the difference is no matter.
+    """
+    sure = seeds.rows((over_clutter(seeds) > SURE) & (seeds.valid_fraction > _WHOLE) & (seeds.window_fraction > _INSIDE))
+    sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
+    if len(sure.depth) < _ENOUGH or np.quantile(sure.chi2_core, 0.25) < _MORE:
+        return 1.0
+    clear = np.median(np.abs(sure.depth) / np.sqrt(noise.variance_at(sure.background)))
+    if np.sqrt(_MOST - 1) < DOUBTFUL * MISFIT * clear:
+        return 1.0
+    guess = guessed_optics(float(np.median(sure.radius_px)))
+    fits = fit_at(film, sure.position_px, sure.radius_px, guess, noise.as_white())
+    return float(np.clip(np.quantile(fits.chi2_uneven / np.maximum(fits.chi2_ring, 1.0), 0.25), 1.0, _MOST))
 
 
 def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> tuple[Optics, float]:
@@ -59,8 +105,11 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     """
     if len(seeds.depth) == 0:
         return Optics(COARSE_SIGMA_PX, COARSE_MU_PX), 0.0
-    clear = seeds.rows((seeds.valid_fraction > 0.98) & (seeds.window_fraction > 0.8))
-    seeds = clear if len(clear.depth) else seeds
+    # those that are whole tell most; not where they are specks beside balls of which noise or saturation takes a part
+    strength, inside = np.minimum(seeds.significance, _CAP), seeds.window_fraction > _INSIDE
+    clear, partly = (inside & (seeds.valid_fraction > least) for least in (_WHOLE, _PARTLY))
+    if partly.any():
+        seeds = seeds.rows(clear if strength[clear].max(initial=0.0) > _SPECKS * strength[partly].max() else partly)
     best = np.argsort(_closeness(seeds, noise))[:_MOST_TRIED]
     position, radius = seeds.position_px[best], seeds.radius_px[best]
 

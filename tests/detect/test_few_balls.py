@@ -1,0 +1,83 @@
+"""Balls that tell little of their blur: few and faint, cut off by the end of the values, or noisier than all that lies beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsa_vision.detect import detect_markers
+from rsa_vision.flags import MarkerFlag
+
+from .films import film_of_balls, grid_of_balls, stored
+from .test_balls import BACKGROUND, DEPTH, nearest
+
+
+@pytest.mark.parametrize(("radius_px", "n"), [(8.0, 1), (12.0, 1), (8.0, 3)])
+@pytest.mark.parametrize("cnr", [5, 10])
+def test_a_few_faint_balls_on_a_plain_film_are_found_and_nothing_else(radius_px: float, n: int, cnr: float) -> None:
+    errors, sd = [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth = np.array([[150.0, 160.0], [420.0, 190.0], [260.0, 430.0]])[:n] + rng.uniform(-20, 20, (n, 2))
+        radius = np.full(n, radius_px)
+        noise_sd = DEPTH * BACKGROUND / cnr
+        film = film_of_balls((600, 600), truth, radius, depth=DEPTH, sigma_px=0.35 * radius_px, noise_sd=noise_sd, rng=rng)
+        found = detect_markers(stored(film), bits=16)
+        assert len(found.images) == n
+        index, gap = nearest(truth, found)
+        assert found.dark_markers
+        assert gap.max() < 1.0
+        errors.append(found.images.position_px[index] - truth)
+        sd.append(np.sqrt(np.einsum("nii->ni", found.images.covariance_px2[index])))
+    ratio = float(np.sqrt(np.square(np.concatenate(errors) / np.concatenate(sd)).mean()))
+    print(f"{n} of radius {radius_px} at CNR {cnr}: error / sd {ratio:.2f}")
+    assert ratio < 1.7  # of eight coordinates, one film in a thousand
+
+
+def test_noise_alone_is_no_ball() -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        film = film_of_balls((600, 600), np.zeros((0, 2)), np.zeros(0), noise_sd=3000.0, noise_blur_px=0.8 * (seed % 2), rng=rng)
+        assert len(detect_markers(stored(film), bits=16).images) == 0
+
+
+@pytest.mark.parametrize("radius_px", [4.0, 8.0, 12.0])
+@pytest.mark.parametrize("part", [0.1, 0.25])
+@pytest.mark.parametrize("bright", [False, True])
+def test_large_balls_cut_off_by_the_end_of_the_values_are_found_and_flagged(radius_px: float, part: float, bright: bool) -> None:
+    rng = np.random.default_rng(3)
+    truth, radius = grid_of_balls(rng, 4, 12 * radius_px, (0.97 * radius_px, 1.03 * radius_px))
+    side = round(52 * radius_px)
+    film = film_of_balls((side, side), truth, radius, depth=0.8, sigma_px=0.35 * radius_px, noise_sd=800.0, rng=rng)
+    film = np.maximum(film, BACKGROUND * (0.2 + 0.8 * part))  # scatter and the foot of the film curve leave no less
+    found = detect_markers(65535 - stored(film) if bright else stored(film), bits=16)
+    assert found.dark_markers != bright
+    assert len(found.images) == len(truth)
+    index, gap = nearest(truth, found)
+    assert gap.max() < 0.5
+    assert (found.images.flags[index] & MarkerFlag.SATURATED).all()
+    assert not (found.images.flags & MarkerFlag.POOR_FIT).any()
+    error = found.images.position_px[index] - truth
+    ratio = float(np.sqrt((error**2 / np.einsum("nii->ni", found.images.covariance_px2[index])).mean()))
+    print(f"radius {radius_px}, cut off at {part}: error / sd {ratio:.2f}")
+    assert 0.6 < ratio < 1.35  # 32 coordinates
+
+
+@pytest.mark.parametrize("noise_blur_px", [0.0, 0.6])
+@pytest.mark.parametrize("radius_px", [8.0])
+def test_large_balls_with_much_more_noise_than_beside_them_are_found(radius_px: float, noise_blur_px: float) -> None:
+    """Films of the logarithm of the exposure: the variance is the inverse of what quanta come through."""
+    rng = np.random.default_rng(7)
+    truth, radius = grid_of_balls(rng, 6, 9 * radius_px, (0.97 * radius_px, 1.03 * radius_px))
+    side = round(57 * radius_px)
+    film = film_of_balls((side, side), truth, radius, depth=0.75, sigma_px=0.35 * radius_px) / BACKGROUND
+    noise = film_of_balls((side, side), truth[:0], radius[:0], background=0.0, noise_sd=1.0, noise_blur_px=noise_blur_px, rng=rng)
+    values = np.log(film) + 0.12 * noise / np.sqrt(film)
+    found = detect_markers(stored(40000 + 12000 * values), bits=16)
+    assert len(found.images) == len(truth)
+    index, gap = nearest(truth, found)
+    assert gap.max() < 0.25 * radius_px
+    error = found.images.position_px[index] - truth
+    ratio = float(np.sqrt((error**2 / np.einsum("nii->ni", found.images.covariance_px2[index])).mean()))
+    print(f"radius {radius_px}, noise blur {noise_blur_px}: error / sd {ratio:.2f}")
+    assert 0.75 < ratio < 1.35
