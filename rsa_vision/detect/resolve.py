@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,32 +9,21 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, ball_image, join
+from rsa_vision.detect.balls import BallFits, join
+from rsa_vision.detect.beside import MOST_IN_GROUP, TOUCH, Background, all_but, groups_of, images_beside
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.crowds import resolve_crowds
-from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear, of_size
+from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear
+from rsa_vision.detect.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
-from rsa_vision.detect.groups import edge_gain, fit_group
+from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.spots import find_spot, with_spot
-from rsa_vision.types import Bool, Float, Int
+from rsa_vision.types import Bool, Float
 
-Background = Callable[[Float, Float], Float]
-"""Images at pixels (cols, rows), in film values."""
-
-Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
-"""Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
-
-TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the fit of the other
-_MOST_IN_GROUP = 5
-OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added to the stated variance
-EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
-_FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
-_MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: each makes what else is fitted less sure
-NEAR_EDGES = 2.5  # times the misfit that balls may leave: what an edge beside them adds to it
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
@@ -95,7 +82,7 @@ def resolve_balls(
 
     def groups_worth_fitting() -> list[list[int]]:
         worth = promising(good, limit, optics.sigma_px, noise) & ~hopeless(good, optics.sigma_px, noise)
-        return [g for g in _groups(good, optics) if worth[g].any()]
+        return [g for g in groups_of(good, optics) if worth[g].any()]
 
     groups, fits = groups_worth_fitting(), []
     clear = look_clear(good, noise)
@@ -106,7 +93,7 @@ def resolve_balls(
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     sure = single.rows(clean)
     blobs = single.rows(~clean & ~_taken(single, sure))
-    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: _beside(sure, np.arange(0), optics, tees))
+    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, tees))
     fits += pairs
     if pairs:  # a blob that two balls explain is no ball
         good = good.rows(~_taken(good, join(pairs)))
@@ -114,10 +101,10 @@ def resolve_balls(
     known = good
     for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
         index = np.array(g)
-        if 1 < len(g) <= _MOST_IN_GROUP:
-            near = _beside(known, index, optics, tees)
+        if 1 < len(g) <= MOST_IN_GROUP:
+            near = all_but(known, index, optics, tees)
             fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, near))
-        elif len(g) > _MOST_IN_GROUP:
+        elif len(g) > MOST_IN_GROUP:
             fits.append(_peel(film, good.rows(index), optics, noise, tees))
     alone = np.array([g[0] for g in groups if len(g) == 1], dtype=np.intp)
     if len(alone):
@@ -139,7 +126,7 @@ def resolve_balls(
         distinct(found, noise),
         optics,
         noise,
-        lambda balls, members: _beside(balls, members, optics, tees),
+        lambda balls, members: all_but(balls, members, optics, tees),
         lambda at, radius: _deep(film, at, radius, tees),
     )
     found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
@@ -149,59 +136,10 @@ def resolve_balls(
     by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)
     found, edged = join([found, drawn]), np.append(edged, np.zeros(len(drawn.depth), bool))
     touching = np.zeros(len(found.depth), bool)
-    for g in _groups(found, optics):
+    for g in groups_of(found, optics):
         touching[g] = len(g) > 1
     touching[by_spot] |= in_doubt
     return found, touching, edged, by_spot
-
-
-def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> tuple[BallFits, Bool]:
-    """Fit again, with an edge in the background, the balls that lie on or beside one (the likelihood tells); say which they are.
-
-    An edge that a quadratic surface cannot follow pulls the centre. What the edge model moves it by says how much is at stake: half of that
-    is added to the stated error, since edges bend and have other profiles than the model's.
-    """
-    fits = fits.rows(of_size(fits, optics.sigma_px, noise))
-    parts, edged_too = [fits.rows(slice(0))], []
-    worth = ~hopeless(fits, optics.sigma_px, noise)
-    for g in _groups(fits, optics):
-        index = np.array(g)
-        edged_too.append(np.zeros(len(g), bool))
-        beside = _beside(fits, index, optics, tees)
-        plain = fits.rows(index)
-        # a size at the limit is not fitted: nothing that comes to rest there is a ball
-        if len(g) > _MOST_IN_GROUP or not worth[index].any() or (plain.radius_px >= RADIUS_PX[1]).any():
-            parts.append(plain)
-            continue
-        foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside) / noise.correlation.sum()
-        if foreseen < _FORESEEN * EDGE_GAIN:
-            parts.append(plain)
-            continue
-        flat = fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside)
-        models: list[BallFits] = []
-        for taken, bent in ((False, False), (True, False), (False, True), (True, True)):
-            how = {"edge": True, "taken": taken, "bent": bent}
-            models.append(fit_group(film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, **how))
-        worths = [
-            _gain(m, models[0], noise) - _MORE_GAIN * more if m.converged.all() else -np.inf
-            for m, more in zip(models, (0, 1, 1, 2), strict=True)
-        ]
-        edged = models[int(np.argmax(worths))]
-        lost = plausible(plain, noise) & ~plausible(edged, noise)
-        if _gain(edged, flat, noise) < EDGE_GAIN or not edged.converged.all() or lost.any():
-            parts.append(plain)
-            continue
-        shift = edged.position_px - plain.position_px
-        covariance = edged.covariance.copy()
-        covariance[:, :2, :2] += OF_SHIFT * shift[:, :, None] * shift[:, None, :]
-        parts.append(replace(edged, covariance=covariance))
-        edged_too[-1][:] = True
-    return join(parts), np.concatenate([np.zeros(0, bool), *edged_too])
-
-
-def _gain(fits: BallFits, simpler: BallFits, noise: NoiseModel) -> float:
-    """Return twice the log-likelihood that one model of a group gains over another."""
-    return float(2 * (fits.log_likelihood[0] - simpler.log_likelihood[0]) / noise.correlation.sum())
 
 
 def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
@@ -294,37 +232,6 @@ def inside(fits: BallFits, film: NDArray[Any]) -> Bool:
     return np.asarray((col > -0.5) & (row > -0.5) & (col < film.shape[1] - 0.5) & (row < film.shape[0] - 0.5))
 
 
-def _groups(fits: BallFits, optics: Optics) -> list[list[int]]:
-    """Sets of balls whose images touch."""
-    n = len(fits.depth)
-    if n == 0:
-        return []
-    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
-    touch = gap < fits.radius_px[:, None] + fits.radius_px[None] + TOUCH * optics.sigma_px
-    _, label = connected_components(csr_array(touch), directed=False)
-    return [np.nonzero(label == k)[0].tolist() for k in range(label.max() + 1)]
-
-
-def _beside(known: BallFits, members: Int, optics: Optics, tees: Background | None) -> Background:
-    return lambda cols, rows: images_beside(known, members, optics, tees, cols, rows)[0]
-
-
-def images_beside(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
-    """Return the images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
-    total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
-    doubtful: Bool = np.zeros(cols.shape, np.bool_)
-    reach = known.radius_px + 4 * optics.sigma_px
-    low, high = (np.array([cols.flat[k], rows.flat[k]]) for k in (0, -1))
-    near = np.array(((known.position_px > low - reach[:, None]) & (known.position_px < high + reach[:, None])).all(1))
-    near[members] = False
-    for j in np.nonzero(near)[0]:
-        dx, dy = cols - known.position_px[j, 0], rows - known.position_px[j, 1]
-        image = ball_image(dx.reshape(1, -1), dy.reshape(1, -1), known.radius_px[[j]], optics.sigma_px, optics.mu_px)
-        total = total + known.depth[j] * image.reshape(cols.shape)
-        doubtful = doubtful | (np.hypot(dx, dy) < known.radius_px[j] + optics.sigma_px)
-    return total, doubtful
-
-
 def _unexplained_pairs(
     film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, optics: Optics, tees: Background | None
 ) -> list[Float]:
@@ -348,11 +255,11 @@ def _unexplained_pairs(
             continue
         gap = np.hypot(*(peaks - peaks[i]).T)
         company = np.nonzero((gap < 2 * typical + TOUCH * optics.sigma_px) & (gap > 0.6 * typical) & free & ~used)[0]
-        company = company[np.argsort(gap[company])][: _MOST_IN_GROUP - 1]
+        company = company[np.argsort(gap[company])][: MOST_IN_GROUP - 1]
         known = good.position_px[np.hypot(*(good.position_px - peaks[i]).T) < 2 * typical + TOUCH * optics.sigma_px]
         if len(company) + len(known) == 0 or len(company) > 3:
             continue
-        starts = np.concatenate([peaks[[i]], peaks[company], known])[:_MOST_IN_GROUP]
+        starts = np.concatenate([peaks[[i]], peaks[company], known])[:MOST_IN_GROUP]
         used[[i, *company]] = True
         out.append(np.column_stack([starts, np.full(len(starts), typical)]))
     return out[:200]

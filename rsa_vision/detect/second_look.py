@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.beside import images_beside
 from rsa_vision.detect.candidates import SCALES, Candidates
 from rsa_vision.detect.decide import LEAST_KNOWN, over_clutter
+from rsa_vision.detect.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.find import distinct, fit_at, plausible, promising
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import NEAR_EDGES, beside_edges, images_beside, inside
+from rsa_vision.detect.resolve import inside
 from rsa_vision.types import Bool, Float
 
 _CLEAR = 0.9  # of the limit, over clutter

@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import polynomial
 from rsa_vision.detect.balls import BallFits, slopes, uneven_white
+from rsa_vision.detect.beside import Beside
 from rsa_vision.detect.decide import EDGE
+from rsa_vision.detect.edges import OF_SHIFT
 from rsa_vision.detect.find import CHANCE
 from rsa_vision.detect.foreign import foreign, in_line, robust_residual
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.random_effects import Common, Solution, Windows, hold, solve, variance_of
-from rsa_vision.detect.resolve import OF_SHIFT, Beside
 from rsa_vision.detect.specks import Specks, find_specks
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import proportion, usual_size
