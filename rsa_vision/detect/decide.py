@@ -102,7 +102,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     if len(radii) < LEAST_KNOWN:
         # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
         company = _of_like_spread(_spread(fits, sigma_px), sure) >= _COMPANY
-        return np.asarray(sure & (company | (close & (strength > ALONE))))
+        alone = close & (strength > ALONE) & ~_soft_shadows(fits.radius_px, height, sure & company)
+        return np.asarray(sure & (company | alone))
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
     least = np.where(close, FAINT, UNEXCUSED)
@@ -113,6 +114,13 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
     return np.asarray((fits.significance > limit) & alike & (sure | (strength > 0.5 * SURE)))
+
+
+def _soft_shadows(radius_px: Float, height: Float, known: Bool) -> Bool:
+    """Say what is larger than all known balls and fainter: a larger ball takes away more."""
+    if not known.any():
+        return np.zeros(len(known), bool)
+    return np.asarray((radius_px > _LARGER * radius_px[known].max()) & (height < UNEXCUSED * np.median(height[known])))
 
 
 def _not_faint(pattern: Bool, height: Float) -> Bool:
