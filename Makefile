@@ -9,8 +9,8 @@ STAMP := $(VENV)/.installed
 demo: $(STAMP)  ## a small synthetic study, rendered and measured, with its report
 	$(BIN)/rsa-vision demo demo
 
-test: $(STAMP)
-	$(BIN)/python -m pytest -n auto
+test: $(STAMP)  ## one worker a processor, each with one thread: more of them get in the way
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
