@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits, join
-from rsa_vision.detect.beside import images_beside
+from rsa_vision.detect.beside import images_beside, lapping_balls
 from rsa_vision.detect.candidates import Candidates, find_candidates
 from rsa_vision.detect.decide import EDGE, are_balls
 from rsa_vision.detect.find import (
@@ -37,7 +37,7 @@ from rsa_vision.detect.optics import ball_evidence, estimate_optics, first_noise
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import doubt_of_number, lapping_balls, resolve_balls
+from rsa_vision.detect.resolve import doubt_of_number, resolve_balls
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle

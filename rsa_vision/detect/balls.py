@@ -11,7 +11,7 @@ from rsa_vision.detect.ball_equations import invert, pixels_of, polynomial, weig
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import Patches
 from rsa_vision.detect.profiles import BallTable, Optics, ball_table
-from rsa_vision.detect.whitening import whiten
+from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Bool, Float, Int
 
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are what is looked for
@@ -273,7 +273,7 @@ def mirrored(local: Float, size: int) -> Int:
 
 def uneven_white(residual: Float, weight: Float, local: Float, size: int, core: Bool, noise: NoiseModel) -> Float:
     """Return the same of residuals whose noise is made white first, as fits of centres weigh them."""
-    white = whiten((residual * np.sqrt(weight)).reshape(-1, size, size), noise).reshape(residual.shape)
+    white = whiten_rows(residual * np.sqrt(weight), size, noise)
     return uneven(white, (weight > 0).astype(np.float64), local, size, core)
 
 

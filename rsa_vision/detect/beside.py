@@ -1,10 +1,12 @@
-"""What lies beside a ball: which touch each other, and the images of all others, to be taken away."""
+"""What lies beside a ball: which touch each other, the images of all others, to be taken away, and what is around them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -33,6 +35,12 @@ def groups_of(fits: BallFits, optics: Optics) -> list[list[int]]:
     return [np.nonzero(label == k)[0].tolist() for k in range(label.max() + 1)]
 
 
+def lapping_balls(fits: BallFits) -> Bool:
+    """Say whose shadows lie over each other, shape (n, n); each over its own."""
+    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
+    return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
+
+
 def all_but(known: BallFits, members: Int, optics: Optics, tees: Background | None) -> Background:
     """Return the images of the tees and of all balls but ``members``, as a function of pixels (cols, rows)."""
     return lambda cols, rows: images_beside(known, members, optics, tees, cols, rows)[0]
@@ -52,3 +60,16 @@ def images_beside(known: BallFits, members: Int, optics: Optics, tees: Backgroun
         total = total + known.depth[j] * image.reshape(cols.shape)
         doubtful = doubtful | (np.hypot(dx, dy) < known.radius_px[j] + optics.sigma_px)
     return total, doubtful
+
+
+def deep_at(film: NDArray[Any], peaks: Float, radius: float, tees: Background | None) -> Float:
+    """How far the film less its tees differs at these places from the median of a ring well outside a ball there."""
+    angle = 2 * np.pi * np.arange(16) / 16
+    reach = 2 * radius + 3
+    cols = np.rint(peaks[:, :1] + reach * np.cos(angle)).astype(np.intp).clip(0, film.shape[1] - 1)
+    rows = np.rint(peaks[:, 1:] + reach * np.sin(angle)).astype(np.intp).clip(0, film.shape[0] - 1)
+    col, row = np.rint(peaks).astype(np.intp).T
+    middle = film[row.clip(0, film.shape[0] - 1), col.clip(0, film.shape[1] - 1)].astype(np.float64)
+    if tees is not None:
+        middle -= tees(*peaks.T)
+    return np.asarray(np.abs(middle - np.median(film[rows, cols], axis=1)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect.balls import BallFits, join
+from rsa_vision.detect.beside import Background, all_but, deep_at
 from rsa_vision.detect.blobs import LEAST_APART, STRETCH, long_axis
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.decide import LEAST_KNOWN, look_clear
 from rsa_vision.detect.find import CHANCE, DOUBTFUL, MISFIT, fit_at, misfit, plausible
 from rsa_vision.detect.groups import fit_group, images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.patches import weighted_least_squares
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import Bool, Float, Int
+from rsa_vision.types import Bool, Float
 
 _MOST = 4  # balls of a crowd
 _VAIN = 40  # attempts of a film that may fail; what one ball explains best goes first
@@ -41,8 +40,7 @@ def resolve_crowds(
     found: BallFits,
     optics: Optics,
     noise: NoiseModel,
-    beside: Callable[[BallFits, Int], Any],
-    deep: Callable[[Float, float], Float],
+    tees: Background | None,
 ) -> BallFits:
     """Explain what was left over by a few of the film's own balls.
 
@@ -55,10 +53,8 @@ def resolve_crowds(
         Balls of the film.
     optics : Optics
     noise : NoiseModel
-    beside : callable
-        ``beside(balls, members)``: what makes the images of the tees and of all these balls but the members, for the fits to subtract.
-    deep : callable
-        ``deep(places, radius)``: how far the film differs there from what is around a ball of that radius.
+    tees : callable, optional
+        Images of pins and tees, to be subtracted.
 
     Returns
     -------
@@ -71,7 +67,7 @@ def resolve_crowds(
     if len(known.depth) < LEAST_KNOWN:
         return found
     radius, depth = float(np.median(known.radius_px)), float(np.median(known.depth))
-    others = beside(found, np.arange(0))
+    others = all_but(found, np.arange(0), optics, tees)
 
     def others_of(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
         return others(cols, rows), np.zeros(cols.shape, bool)
@@ -79,7 +75,7 @@ def resolve_crowds(
     place = candidates.position_px
     gap = np.hypot(*(place[:, None] - found.position_px[None]).transpose(2, 0, 1))
     place = place[(gap > found.radius_px + 0.6 * radius).all(axis=1)]
-    place = place[deep(place, radius) > _DEEP * abs(depth)]
+    place = place[deep_at(film, place, radius, tees) > _DEEP * abs(depth)]
     if len(place) == 0:
         return found
     single = fit_at(film, place, np.full(len(place), _START * radius), optics, noise, others_of, quick=True)
@@ -98,17 +94,17 @@ def resolve_crowds(
         if crowd is None:
             vain = np.concatenate([vain, at[None]])
         else:
-            found = _joined(film, found, crowd, optics, noise, beside)
+            found = _joined(film, found, crowd, optics, noise, tees)
     return found
 
 
-def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, beside: Any) -> BallFits:
+def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
     """Put a crowd to the balls found, fitted again together with those that it laps over."""
     gap = np.hypot(*(found.position_px[:, None] - crowd.position_px[None]).transpose(2, 0, 1))
     near = (gap < found.radius_px[:, None] + crowd.radius_px).any(axis=1)
     if near.any():
         start = join([found.rows(near), crowd])
-        others = beside(found, np.flatnonzero(near))
+        others = all_but(found, np.flatnonzero(near), optics, tees)
         crowd = fit_group(film, start.position_px, start.radius_px, optics.sigma_px, optics.mu_px, noise, others)
         if not (plausible(crowd, noise) & (misfit(crowd, noise) < DOUBTFUL * MISFIT)).all():
             return found
@@ -142,8 +138,7 @@ def _most_left(film: NDArray[Any], fits: BallFits, radius: float, optics: Optics
     window = window_around(film, fits.position_px, fits.radius_px, optics.sigma_px, noise, others)
     local = fits.position_px - window.corner_px
     basis = images_in(window, window.surface, local, fits.radius_px, optics.sigma_px, optics.mu_px).linear
-    data, weight = window.raw - window.neighbours, window.valid / noise.variance_at(window.raw)
-    left = (data - basis @ weighted_least_squares(basis, weight, data, 1e-9)) * window.valid * np.sign(fits.depth[0])
+    left = window.left_by(basis, noise)[0] * window.valid * np.sign(fits.depth[0])
     smooth = gaussian_filter(left.reshape(window.size, window.size), 0.5 * radius).ravel()
     near = (np.hypot(window.cols - local[:, :1], window.rows - local[:, 1:]) < 2.5 * radius).any(axis=0)
     k = int(np.argmax(np.where(near, smooth, -np.inf)))

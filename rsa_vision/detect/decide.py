@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from rsa_vision.detect.balls import RADIUS_PX, BallFits
-from rsa_vision.detect.find import CLEAR, EXPLAINED, MISFIT, misfit
+from rsa_vision.detect.find import EXPLAINED, MISFIT, SURE, misfit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float
 
-SURE = CLEAR
 ALONE = 10.0  # the same for marks of which there are not enough to tell what they are like
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them

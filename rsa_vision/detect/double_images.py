@@ -12,7 +12,7 @@ from rsa_vision.detect.balls import BallFits
 from rsa_vision.detect.blobs import STRETCH, long_axis
 from rsa_vision.detect.groups import GroupWindow, fit_group, images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.patches import columns, weighted_least_squares
+from rsa_vision.detect.patches import columns
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
@@ -75,8 +75,7 @@ def gain_over_two(
 
 def _left(window: GroupWindow, basis: Float, under: Bool, noise: NoiseModel) -> float:
     """Sum of squares that a linear combination leaves of these pixels, in units of the variance of the noise."""
-    weight, data = window.valid / noise.variance_at(window.raw), window.raw - window.neighbours
-    residual = data - basis @ weighted_least_squares(basis, weight, data, 1e-9)
+    residual, weight = window.left_by(basis, noise)
     return float((weight * residual**2)[under].sum())
 
 

@@ -28,7 +28,7 @@ DOUBTFUL = 0.6  # of it: more may be two balls, or something else
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
 PROMISING = 0.75  # of the significance a mark must have: a quick fit may be so far off
-CLEAR = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
+SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
 
@@ -180,7 +180,7 @@ def distinct(fits: BallFits, noise: NoiseModel) -> BallFits:
     if len(fits.depth) == 0:
         return fits
     near = KDTree(fits.position_px).query_ball_point(fits.position_px, 0.5 * fits.radius_px)
-    speck = fits.significance < CLEAR * np.sqrt(np.maximum(fits.chi2_ring, 1.0))
+    speck = fits.significance < SURE * np.sqrt(np.maximum(fits.chi2_ring, 1.0))
     order, kept = np.lexsort((misfit(fits, noise) + (1 - fits.explained), speck)), np.zeros(len(near), bool)
     for i in order:
         kept[i] = not kept[near[i]].any()

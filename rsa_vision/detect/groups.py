@@ -16,7 +16,7 @@ from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.profiles import ball_table
-from rsa_vision.detect.whitening import whiten
+from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Float
 
 _STEPS = 25
@@ -137,9 +137,8 @@ def fit_group(
 
 def _estimator(weighted: Float, size: int, noise: NoiseModel) -> Float:
     """Linear estimator (p, n) of the parameters whose derivatives are (n, p), in units of the noise as the values are."""
-    white = whiten(weighted.T.reshape(-1, size, size), noise).reshape(weighted.T.shape)
-    to_white = invert((white @ white.T)[None])[0] @ white
-    return whiten(to_white.reshape(-1, size, size), noise).reshape(white.shape)
+    white = whiten_rows(weighted.T, size, noise)
+    return whiten_rows(invert((white @ white.T)[None])[0] @ white, size, noise)
 
 
 def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None) -> float:
@@ -186,6 +185,11 @@ class GroupWindow:
     neighbours: Float
     valid: Float
     surface: Float  # (n, 6)
+
+    def left_by(self, basis: Float, noise: NoiseModel) -> tuple[Float, Float]:
+        """Return what the best combination of the columns of ``basis`` leaves, and the weights of the pixels."""
+        weight, data = self.valid / noise.variance_at(self.raw), self.raw - self.neighbours
+        return data - basis @ weighted_least_squares(basis, weight, data), weight
 
 
 def window_around(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: float, noise: NoiseModel, others: Any) -> GroupWindow:

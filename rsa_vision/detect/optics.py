@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import BallFits, ball_image, slopes
-from rsa_vision.detect.decide import SURE, over_clutter
+from rsa_vision.detect.decide import over_clutter
 from rsa_vision.detect.find import (
     COARSE_MU_PX,
     COARSE_SIGMA_PX,
     DOUBTFUL,
     EXPLAINED,
     MISFIT,
+    SURE,
     fit_at,
     guessed_optics,
     misfit,

@@ -15,7 +15,7 @@ from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.surroundings import Modes
 from rsa_vision.detect.usual import Proportion, Size
-from rsa_vision.detect.whitening import whiten
+from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Bool, Float
 
 _NONE = 1e-3  # of the noise: what is not there
@@ -115,14 +115,10 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
             weight = windows.valid / noise.variance_at(ball + np.matmul(theta[:, None], curves)[:, 0] + windows.added)
             root = np.sqrt(weight)[:, None]
             # filtered in single precision, added up in double
-            seen = (
-                whiten((images * root).astype(np.float32).reshape(*images.shape[:2], side, side), noise)
-                .reshape(images.shape)
-                .astype(np.float64)
-            )
+            seen = whiten_rows((images * root).astype(np.float32), side, noise).astype(np.float64)
             products = np.matmul(seen, seen.swapaxes(1, 2))
-        white = whiten((left[:, None] * root).reshape(-1, side, side), noise).reshape(len(depth), -1, 1)
-        normal, right = products.copy(), np.matmul(seen, white)[:, :, 0]
+        white = whiten_rows(left * root[:, 0], side, noise)
+        normal, right = products.copy(), np.matmul(seen, white[:, :, None])[:, :, 0]
         if step == 1:  # once the background is known roughly
             own = _own_share(normal, right, precision[:, _PER_BALL:], common.differ)
             structure = structure * own[:, None]
@@ -136,8 +132,7 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
         radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
         residual = left - np.matmul(change[:, None], images)[:, 0]
-    estimator = np.matmul(inverse[:, :2], seen).reshape(len(depth), 2, side, side)
-    estimator = whiten(estimator, noise).reshape(len(depth), 2, -1) * root
+    estimator = whiten_rows(np.matmul(inverse[:, :2], seen), side, noise) * root
     plain, apart = estimator, np.zeros((len(depth), 2))
     if not noise.is_white:  # by weights alone, the surfaces held in the same proportion
         precision[:, _PER_BALL:] *= known.noise

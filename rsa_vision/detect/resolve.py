@@ -10,13 +10,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls import BallFits, join
-from rsa_vision.detect.beside import MOST_IN_GROUP, TOUCH, Background, all_but, groups_of, images_beside
+from rsa_vision.detect.beside import MOST_IN_GROUP, TOUCH, Background, all_but, deep_at, groups_of, images_beside, lapping_balls
 from rsa_vision.detect.blobs import split_blobs
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.crowds import resolve_crowds
-from rsa_vision.detect.decide import LEAST_KNOWN, SURE, hopeless, look_clear
+from rsa_vision.detect.decide import LEAST_KNOWN, hopeless, look_clear
 from rsa_vision.detect.edges import NEAR_EDGES, beside_edges
-from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, distinct, fit_at, misfit, plausible, promising
+from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
@@ -120,15 +120,7 @@ def resolve_balls(
     alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
     perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
-    found = resolve_crowds(
-        film,
-        candidates,
-        distinct(found, noise),
-        optics,
-        noise,
-        lambda balls, members: all_but(balls, members, optics, tees),
-        lambda at, radius: _deep(film, at, radius, tees),
-    )
+    found = resolve_crowds(film, candidates, distinct(found, noise), optics, noise, tees)
     found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
     found, edged = beside_edges(film, distinct(found, noise), optics, noise, tees)
     balls = plausible(found, noise)
@@ -204,12 +196,6 @@ def doubt_of_number(fits: BallFits) -> Float:
     return out
 
 
-def lapping_balls(fits: BallFits) -> Bool:
-    """Say whose shadows lie over each other, shape (n, n); each over its own."""
-    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
-    return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
-
-
 def _taken(fits: BallFits, good: BallFits) -> Bool:
     """Say which fits lie on a ball that is already known."""
     gap = np.hypot(*(fits.position_px[:, None] - good.position_px[None]).transpose(2, 0, 1))
@@ -243,7 +229,7 @@ def _unexplained_pairs(
     peaks = candidates.position_px[fine]
     if len(peaks) == 0:
         return []
-    peaks = peaks[_deep(film, peaks, typical, tees) > 0.4 * np.median(np.abs(like.depth))]
+    peaks = peaks[deep_at(film, peaks, typical, tees) > 0.4 * np.median(np.abs(like.depth))]
     if len(peaks) == 0:
         return []
     gaps = np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1))
@@ -263,19 +249,6 @@ def _unexplained_pairs(
         used[[i, *company]] = True
         out.append(np.column_stack([starts, np.full(len(starts), typical)]))
     return out[:200]
-
-
-def _deep(film: NDArray[Any], peaks: Float, radius: float, tees: Background | None) -> Float:
-    """How far the film less its tees differs at these places from the median of a ring well outside a ball there."""
-    angle = 2 * np.pi * np.arange(16) / 16
-    reach = 2 * radius + 3
-    cols = np.rint(peaks[:, :1] + reach * np.cos(angle)).astype(np.intp).clip(0, film.shape[1] - 1)
-    rows = np.rint(peaks[:, 1:] + reach * np.sin(angle)).astype(np.intp).clip(0, film.shape[0] - 1)
-    col, row = np.rint(peaks).astype(np.intp).T
-    middle = film[row.clip(0, film.shape[0] - 1), col.clip(0, film.shape[1] - 1)].astype(np.float64)
-    if tees is not None:
-        middle -= tees(*peaks.T)
-    return np.asarray(np.abs(middle - np.median(film[rows, cols], axis=1)))
 
 
 def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:

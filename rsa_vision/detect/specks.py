@@ -15,7 +15,7 @@ import numpy as np
 from rsa_vision.detect.balls import mirrored
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.random_effects import Solution
-from rsa_vision.detect.whitening import whiten
+from rsa_vision.detect.whitening import whiten, whiten_rows
 from rsa_vision.types import Float
 
 _SPREADS_PX: Final = (1.0, 1.6)  # of dust as scanners draw it; half as much and twice as much are found as well
@@ -24,10 +24,7 @@ _BEYOND_PX: Final = 1.0  # the rim
 _SURE: Final = 4.5  # standard deviations that none of a film's places reaches by chance
 _SHARE: Final = 0.5  # of the significance there is before anything else is fitted anew
 _LEAST: Final = 1 / 3  # of a speck, that the fit does not take for something else: with less nothing is known of it
-_HEIGHT: Final = (
-    0.03,
-    0.5,
-)  # of the ball's depth, and as much less opposite: models of balls are no truer, and specks no higher than balls
+_HEIGHT: Final = (0.03, 0.5)  # of the ball's depth, half of a speck's: models of balls are no truer, and specks no higher than balls
 _NOTHING: Final = 1e-30
 
 
@@ -38,7 +35,7 @@ class Specks:
     Attributes
     ----------
     shift_px : ndarray of shape (n, 2)
-        To be taken from the centres; 0 where there is no speck.
+        To be added to the centres; 0 where there is no speck.
     covariance : ndarray of shape (n, 2, 2)
         Of that.
     image : ndarray of shape (n, pixels)
@@ -76,7 +73,7 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
     opposite = mirrored(solution.local_px, side)
     near = np.hypot(cols - solution.local_px[:, :1], rows - solution.local_px[:, 1:]) < (rim_px + _BEYOND_PX)[:, None]
     near &= seen & np.take_along_axis(seen, opposite, 1)
-    left = _white(_white(solution.residual * root, side, noise), side, noise) * root
+    left = whiten_rows(whiten_rows(solution.residual * root, side, noise), side, noise) * root
     best = _SURE * np.sqrt(excess)
     for spread_px in _SPREADS_PX:
         told, alone = _at_every_place(left, side, spread_px), _energy(spread_px, noise) * solution.weight
@@ -85,7 +82,7 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
         for i in np.flatnonzero(likely.any(axis=1)):
             place = np.flatnonzero(near[i])
             across = opposite[i, place]
-            images = _at_every_place(_white(solution.white[i], side, noise) * root[i], side, spread_px)
+            images = _at_every_place(whiten_rows(solution.white[i], side, noise) * root[i], side, spread_px)
             taken = images[:, place] - images[:, across]
             fitted = solution.inverse[i] @ taken
             apart = np.square([cols[place] - cols[across], rows[place] - rows[across]]).sum(axis=0)
@@ -106,10 +103,6 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
             out.covariance[i] = excess[i] / own[k] * np.outer(fitted[:2, k], fitted[:2, k])
             out.image[i] = height[k] * (_at_every_place(spots, side, spread_px)[0] - fitted[:, k] @ solution.images[i])
     return out
-
-
-def _white(images: Float, side: int, noise: NoiseModel) -> Float:
-    return whiten(images.reshape(-1, side, side), noise).reshape(images.shape)
 
 
 def _at_every_place(images: Float, side: int, spread_px: float) -> Float:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, slopes, uneven, uneven_white
 from rsa_vision.detect.blobs import LEAST_GAIN
-from rsa_vision.detect.decide import LEAST_KNOWN, SURE, over_clutter
+from rsa_vision.detect.decide import LEAST_KNOWN, over_clutter
 from rsa_vision.detect.double_images import gain_over_two
-from rsa_vision.detect.find import DOUBTFUL, MISFIT, misfit, plausible
+from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, misfit, plausible
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table

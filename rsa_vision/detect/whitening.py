@@ -47,6 +47,11 @@ def whiten(images: NDArray[Any], noise: NoiseModel) -> NDArray[Any]:
     return np.asarray(out.reshape(apart.shape)[:, :, :cols].swapaxes(0, 1).reshape(images.shape))
 
 
+def whiten_rows(windows: NDArray[Any], side: int, noise: NoiseModel) -> NDArray[Any]:
+    """Return the same of square windows that are rows of pixels, shape (..., side * side)."""
+    return whiten(windows.reshape(-1, side, side), noise).reshape(windows.shape)
+
+
 @lru_cache(maxsize=64)
 def _kernel(correlation: bytes, side: int) -> NDArray[np.float64]:
     power = power_spectrum(np.frombuffer(correlation).reshape(side, side), (_PERIOD, _PERIOD))
