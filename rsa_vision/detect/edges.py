@@ -63,20 +63,21 @@ def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
             parts.append(plain)
             continue
         at = (film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside)
-        flat, edged = fit_group(*at), fit_group(*at, edge=True)
-        straight, least = edged, 0.0 if edged.converged.all() else -np.inf
+        flat, straight = fit_group(*at), fit_group(*at, edge=True)
+        models = [(0.0 if straight.converged.all() else -np.inf, straight)]
         for taken, bent in ((True, False), (False, True), (True, True)):
             other = fit_group(*at, edge=True, taken=taken, bent=bent)
-            worth_more = _gain(other, straight, noise) - _MORE_GAIN * (taken + bent)
-            if other.converged.all() and worth_more > least:
-                edged, least = other, worth_more
+            if other.converged.all():
+                models.append((_gain(other, straight, noise) - _MORE_GAIN * (taken + bent), other))
+        best, edged = max(models, key=lambda model: model[0])
         lost = plausible(plain, noise) & ~plausible(edged, noise)
         if _gain(edged, flat, noise) < EDGE_GAIN or not edged.converged.all() or lost.any():
             parts.append(plain)
             continue
-        shift = edged.position_px - plain.position_px
         covariance = edged.covariance.copy()
-        covariance[:, :2, :2] += OF_SHIFT * shift[:, :, None] * shift[:, None, :]
+        for rival in [plain, *(model for worth_it, model in models if worth_it > best - _MORE_GAIN)]:
+            shift = edged.position_px - rival.position_px
+            covariance[:, :2, :2] += OF_SHIFT * shift[:, :, None] * shift[:, None, :]
         parts.append(replace(edged, covariance=covariance))
         edged_too[-1][:] = True
     return join(parts), np.concatenate([np.zeros(0, bool), *edged_too])

@@ -105,8 +105,7 @@ def fit_group(
     root = np.sqrt(weight)[:, None]
     estimator = _estimator(jac * root, size, noise)[: 4 * k]
     last = (estimator @ (residual * root[:, 0])).reshape(4, k)
-    certain = [i for i in range(linear.shape[1]) if i not in images.of_grounds]  # whether it is there, not how much of the edge it takes
-    influence = np.concatenate([estimator, _estimator(linear[:, certain] * root, size, noise)[:k]]).reshape(5 * k, size, size)
+    influence = np.concatenate([estimator, _estimator(linear * root, size, noise)[:k]]).reshape(5 * k, size, size)
     whole = influence_covariance(influence, noise.correlation)
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
     core = distance < (radius + sigma_px)[:, None]

@@ -41,6 +41,19 @@ def test_noise_alone_is_no_ball() -> None:
         assert len(detect_markers(stored(film), bits=16).images) == 0
 
 
+@pytest.mark.parametrize("reach_px", [12.0, 16.0])
+def test_a_soft_shadow_among_faint_balls_is_none(reach_px: float) -> None:
+    rng = np.random.default_rng(5)
+    truth, radius = grid_of_balls(rng, 7, 70.0, (4.0, 4.0))
+    shadow, truth = truth[24], np.delete(truth, 24, axis=0)
+    film = film_of_balls((490, 490), truth, radius[1:], depth=0.5, sigma_px=1.4, noise_sd=3000.0, rng=rng)
+    row, col = np.mgrid[0:490, 0:490]
+    film -= 3000.0 * np.sqrt(np.maximum(1 - (np.hypot(col - shadow[0], row - shadow[1]) / reach_px) ** 2, 0))
+    found = detect_markers(stored(film), bits=16)
+    assert len(found.images) == len(truth)
+    assert nearest(truth, found)[1].max() < 1.0
+
+
 @pytest.mark.parametrize("radius_px", [4.0, 8.0, 12.0])
 @pytest.mark.parametrize("part", [0.1, 0.25])
 @pytest.mark.parametrize("bright", [False, True])
