@@ -24,6 +24,7 @@ Images = Callable[[Float, Float], Float]
 CELL = 0.3  # pixels between the nodes of a needle table
 GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
+_LOG_GRID = math.log(GRID)
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
 _PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
@@ -140,6 +141,18 @@ def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, 
     return (-pad, -half * CELL), (math.ceil((length + 2 * pad) / CELL) + 1, 2 * half + 1)
 
 
+@lru_cache(maxsize=1024)
+def _table_for(
+    width_step: int, length_step: int, taper: float, sigma_px: float, mu_px: float, bend: float
+) -> tuple[tuple[float, ...], tuple[float, float], tuple[float, float], tuple[float, float]]:
+    """Return the key of the table for needles of about this size, where its grid begins, and, in cells, its middle and how far it is seen."""
+    half_width, length, sigma = round(GRID**width_step, 4), round(GRID**length_step, 4), round(sigma_px, 3)
+    first, (n_s, n_p) = _grid(half_width, length, sigma)
+    middle, rim = ((n_s - 1) / 2, (n_p - 1) / 2), (_PAD - _FADED) * sigma / CELL
+    key = half_width, length, round(taper, 3), sigma, round(mu_px, 4), round(bend, 4)
+    return key, first, middle, (middle[0] - rim, middle[1] - rim)
+
+
 @lru_cache(maxsize=256)
 def _table(
     half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float, more: str
@@ -176,8 +189,8 @@ def _look_up(table: NDArray[np.float32], at_s: Float, at_p: Float) -> Float:
     part_s, part_p = (at_s - low_s).astype(np.float32), (at_p - low_p).astype(np.float32)
     node = low_s * n_p + low_p
     nodes = table.reshape(len(table), -1)
-    near: NDArray[np.float32] = nodes.take(node, axis=1)
-    beside, far, across = (nodes.take(node + step, axis=1) for step in (1, n_p, n_p + 1))
+    near: NDArray[np.float32] = nodes.take(node, axis=1, mode="wrap")
+    beside, far, across = (nodes.take(node + step, axis=1, mode="wrap") for step in (1, n_p, n_p + 1))  # within: spares the check
     for low, high in ((near, beside), (far, across)):
         high -= low
         high *= part_p
@@ -248,19 +261,16 @@ class _Seen:
 
     @staticmethod
     def of(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> _Seen:
-        sizes = shape.half_width_px, shape.length_px
-        half_width, length = (round(GRID ** math.floor(math.log(size) / math.log(GRID)), 4) for size in sizes)
-        film = round(optics.sigma_px, 3), round(optics.mu_px, 4), round(optics.bend, 4)
-        first, (n_s, n_p) = _grid(half_width, length, film[0])
-        cell_s, cell_p = CELL * shape.length_px / length, CELL * shape.half_width_px / half_width
+        steps = (math.floor(math.log(size) / _LOG_GRID) for size in (shape.half_width_px, shape.length_px))
+        key, first, middle, reach = _table_for(*steps, shape.taper, optics.sigma_px, optics.mu_px, optics.bend)
+        cell_s, cell_p = CELL * shape.length_px / key[1], CELL * shape.half_width_px / key[0]
         c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
         at_s = dx * (c / cell_s) + (dy * (s / cell_s) - first[0] / CELL)
         at_p = dy * (c / cell_p) - (dx * (s / cell_p) + first[1] / CELL)
-        middle_s, middle_p, rim = (n_s - 1) / 2, (n_p - 1) / 2, (_PAD - _FADED) * film[0] / CELL
-        within = (np.abs(at_s - middle_s) < middle_s - rim) & (np.abs(at_p - middle_p) < middle_p - rim)
+        within = (np.abs(at_s - middle[0]) < reach[0]) & (np.abs(at_p - middle[1]) < reach[1])
         index = np.flatnonzero(within)
-        key = half_width, length, round(shape.taper, 3), *film
-        return _Seen(key, first, cell_s, cell_p, index // len(dx), at_s.ravel()[index], at_p.ravel()[index], index, within.shape)
+        at = at_s.ravel().take(index), at_p.ravel().take(index)
+        return _Seen(key, first, cell_s, cell_p, index // len(dx), *at, index, within.shape)
 
     def values(self, shape: NeedleShape, slants: Float | None, *, slopes: bool) -> tuple[Float, list[Float]]:
         """Return the opacity and what else the tables hold."""
