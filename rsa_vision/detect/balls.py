@@ -155,11 +155,11 @@ def fit_balls(
     pixels = pixels_of(size, stride)
     values = patches.values.reshape(n, -1)
     level = values.mean(1)[:, None]
-    beside = level if extra is None else level + extra.reshape(n, -1)[:, pixels.place]
+    beside = level if extra is None else level + extra.reshape(n, -1).take(pixels.place, axis=1)
     # single precision does once the level is off; what is summed up is summed up in double
-    data = (values[:, pixels.place] - beside).astype(np.float32)
+    data = (values.take(pixels.place, axis=1) - beside).astype(np.float32)
     own = pixels.side <= halves[:, None]
-    valid = (patches.valid.reshape(n, -1)[:, pixels.place] & own).astype(np.float32)
+    valid = (patches.valid.reshape(n, -1).take(pixels.place, axis=1) & own).astype(np.float32)
     local = start_px - patches.corner_px
     low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), np.minimum(min(RADIUS_PX[1], 20.0 * sigma_px), halves - sigma_px)
     radius = np.clip(start_radius_px, low, high)
@@ -218,10 +218,10 @@ def fit_balls(
         influence = np.matmul(of_all, -np.matmul(taken, pixels.surface.T))
         influence[:, :, :reached] += np.matmul(of_all, seen)
         influence *= np.sqrt(weight)[:, None]
-        scatter = influence_covariance(influence[:, :, pixels.back].reshape(n, 5, size, size), noise.correlation)
+        scatter = influence_covariance(influence.take(pixels.back, axis=2).reshape(n, 5, size, size), noise.correlation)
         covariance, variance = scatter[:, :4, :4], scatter[:, 4, 4]
-        under = np.pad(core, ((0, 0), (0, size * size - reached)))[:, pixels.back]
-        all_left, all_weight = residual[:, pixels.back], weight[:, pixels.back]
+        under = np.pad(core, ((0, 0), (0, size * size - reached))).take(pixels.back, axis=1)
+        all_left, all_weight = residual.take(pixels.back, axis=1), weight.take(pixels.back, axis=1)
         chi2_ring = uneven(all_left, all_weight, local, size, ~under)
         chi2_uneven = uneven_white(all_left, all_weight, local, size, under, noise)
     return BallFits(

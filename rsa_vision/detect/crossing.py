@@ -54,7 +54,7 @@ class Window:
 
     def whiten(self, values: Float, noise: NoiseModel) -> Float:
         """Filter values at the pixels, in units of the noise, shape (p, n), so that the noise in them is white."""
-        return np.asarray(whiten(self._boxes(values), noise).reshape(len(values), -1)[:, self.place], np.float64)
+        return np.asarray(whiten(self._boxes(values), noise).reshape(len(values), -1).take(self.place, axis=1), np.float64)
 
     def covariance(self, influence: Float, noise: NoiseModel) -> Float:
         """Return the covariance of linear functions (p, n) of the film's noise at the pixels."""

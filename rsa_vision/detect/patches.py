@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
 
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float, Int
@@ -95,6 +96,8 @@ def damped_solution(normal: Float, right: Float, damping: float) -> Float:
     """Solve normal equations whose columns are scaled to one, ``damping`` added to the scaled diagonal."""
     scale = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
     scaled = normal / (scale[:, None] * scale)
-    scaled.flat[:: len(scale) + 1] += damping
-    solution: Float = np.linalg.solve(scaled, right / scale) / scale
-    return solution
+    scaled.ravel()[:: len(scale) + 1] += damping
+    *_, solution, fails = dgesv(scaled, right / scale)  # numpy's own does the same in twice the time
+    if fails:
+        raise np.linalg.LinAlgError("singular normal equations")
+    return np.asarray(solution / scale)
