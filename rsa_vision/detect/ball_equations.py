@@ -80,6 +80,8 @@ class Equations:
     surface : ndarray of shape (p, 6)
         The background's monomials.
     data, weight : ndarray of shape (n, p)
+    exact : ndarray of shape (n, p)
+        The weights in double precision, for sums.
     inverse : ndarray of shape (n, 6, 6)
         Of the normal matrices of the backgrounds alone.
     right : ndarray of shape (n, 6)
@@ -89,6 +91,7 @@ class Equations:
     surface: Float
     data: NDArray[Any]  # single precision, as the weights
     weight: NDArray[Any]
+    exact: Float
     inverse: Float
     right: Float
 
@@ -97,7 +100,7 @@ class Equations:
         # added up in double precision: radius and depth of a ball that is small against the blur can all but stand for each other
         n, _, reached = images.shape
         images = images.astype(np.float64)
-        weighted = images * self.weight[of, None, :reached]
+        weighted = images * self.exact[of, None, :reached]
         mixed = (weighted.reshape(4 * n, -1) @ self.surface[:reached]).reshape(n, 4, -1)
         taken = np.matmul(mixed, self.inverse[of])
         own = np.matmul(weighted, images.transpose(0, 2, 1))
@@ -123,5 +126,6 @@ class Equations:
 def weighted(pixels: Pixels, data: NDArray[Any], weight: NDArray[Any]) -> Equations:
     """Return the equations of windows with these weights (n, p)."""
     k = pixels.surface.shape[1]
-    normal = (weight @ pixels.squares).reshape(len(data), k, k)
-    return Equations(pixels.surface, data, weight, invert(normal), (weight * data) @ pixels.surface)
+    exact = weight.astype(np.float64)
+    normal = (exact @ pixels.squares).reshape(len(data), k, k)
+    return Equations(pixels.surface, data, weight, exact, invert(normal), (weight * data) @ pixels.surface)

@@ -328,4 +328,4 @@ def derivatives(radius: Float, half: int, sigma_px: float, mu_px: float) -> Floa
 def _by_depth(depth: Float) -> Float:
     """What the derivatives of balls of depth one are to be multiplied by, shape (n, 4)."""
     depth = np.where(depth == 0, 1e-30, depth)
-    return np.stack([-depth, -depth, depth, np.ones_like(depth)], axis=1)
+    return np.asarray(depth[:, None] * [-1.0, -1.0, 1.0, 0.0] + [0.0, 0.0, 0.0, 1.0])

@@ -85,11 +85,14 @@ class BallTable:
         part = col - left.astype(kind)
         reach = int(left.max(initial=0)) + 2
         low, high = self.nodes[:, top, :reach], self.nodes[:, top + 1, :reach]
-        line = (low + frac * (high - low)).reshape(3, -1)
-        rise = np.empty_like(line)
-        np.subtract(line[:, 1:], line[:, :-1], out=rise[:, :-1])
+        line = np.subtract(high, low, out=np.empty(low.shape, low.dtype))  # in one piece, as fancy indices do not leave it
+        line *= frac
+        line += low
+        line = line.reshape(3, -1)
         index = left + (np.arange(len(y)) * reach).reshape((-1,) + (1,) * (x.ndim - 1))
-        value, d_rho, d_radius = line.take(index, axis=1) + part * rise.take(index, axis=1)
+        near, rise = (line.take(index + step, axis=1, mode="wrap") for step in (0, 1))  # none is beyond: "wrap" only spares the check
+        rise -= near
+        value, d_rho, d_radius = near + part * rise
         return value, d_rho, d_radius
 
 
