@@ -116,7 +116,7 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
         spread = _local_spread(answer, _white_spread(noise, level, inner, outer))
         limit = cv2.resize(threshold * spread, (answer.shape[1], answer.shape[0]), interpolation=cv2.INTER_LINEAR)
         significance = cv2.divide(answer, limit, dst=limit)
-        place = np.flatnonzero(np.abs(significance) > FAINT)
+        place = np.flatnonzero((significance > FAINT) | (significance < -FAINT))
         strength = np.asarray(significance.ravel()[place], np.float64)
         out.append(_extrema(answer, place, threshold * strength, level, radius))
         if (level, radius) == JUNCTION_SCALE:

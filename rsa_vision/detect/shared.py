@@ -121,10 +121,11 @@ def fit_shared(
     left = np.array([e.noise_under(own, change) for e, own in zip(systems, moves, strict=True)])
     # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
     under = at_rims(min(usual_square(left), 1.0)) if len(needles) >= LEAST else 1.0
-    errors = _common_errors(windows, systems, normal, precision, noise, under)
+    by_noise = [_by_noise(window, e, noise) for window, e in zip(windows, systems, strict=True)]
+    errors = _common_errors(systems, by_noise, normal, precision, under)
     out = []
-    for window, e, own in zip(windows, systems, moves, strict=True):
-        out += _finished(window, e, own[e.tips].reshape(-1, 2), errors, optics, noise, under, converged)
+    for window, e, own, scatter in zip(windows, systems, moves, by_noise, strict=True):
+        out += _finished(window, e, own[e.tips].reshape(-1, 2), under * scatter, errors, noise, converged)
     return out, optics
 
 
@@ -180,30 +181,28 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
     return out
 
 
-def _common_errors(
-    windows: list[Window], systems: list[Equations], normal: Float, precision: Float, noise: NoiseModel, under: float
-) -> Float:
-    """Covariance of the common parameters, for noise that neighbouring pixels share."""
+def _by_noise(window: Window, e: Equations, noise: NoiseModel) -> Float:
+    """Covariance that noise which neighbouring pixels share makes of the tips, and of what the common parameters are estimated from."""
+    influence = np.concatenate([e.inverse[e.tips] @ e.own, e.common - e.own_by_common.T @ e.own])
+    return window.covariance(window.whiten(influence, noise), noise)
+
+
+def _common_errors(systems: list[Equations], by_noise: list[Float], normal: Float, precision: Float, under: float) -> Float:
+    """Covariance of the common parameters."""
     spread = precision.copy()
-    for window, e in zip(windows, systems, strict=True):
-        unexplained = e.common - e.own_by_common.T @ e.own
-        spread += (under * _of_noise(window, unexplained, noise) + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)) / e.excess
+    for e, scatter in zip(systems, by_noise, strict=True):
+        rest = slice(len(e.tips), None)
+        spread += (under * scatter[rest, rest] + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)) / e.excess
     inverse = np.linalg.inv(normal)
     covariance: Float = inverse @ spread @ inverse
     return covariance
 
 
-def _of_noise(window: Window, white: Float, noise: NoiseModel) -> Float:
-    """Covariance that the film's noise makes of linear functions (p, n) of what is white."""
-    return window.covariance(window.whiten(white, noise), noise)
-
-
 def _finished(
-    window: Window, e: Equations, move: Float, errors: Float, optics: Optics, noise: NoiseModel, under: float, converged: bool
+    window: Window, e: Equations, move: Float, by_noise: Float, errors: Float, noise: NoiseModel, converged: bool
 ) -> list[NeedleFit]:
-    to_tips = e.inverse[e.tips] @ e.own
-    by_common = e.own_by_common[e.tips]
-    covariance = under * _of_noise(window, to_tips, noise) + by_common @ errors @ by_common.T
+    by_common, tips = e.own_by_common[e.tips], slice(len(e.tips))
+    covariance = by_noise[tips, tips] + by_common @ errors @ by_common.T
     of_prior = e.inverse[e.tips] * e.prior  # what is held near to the expected is not exactly there
     covariance = covariance + of_prior @ of_prior.T
     variance = float(noise.variance_at(np.array([e.background]))[0])

@@ -75,7 +75,7 @@ def _correlation(image: NDArray[np.float32], template: NDArray[np.float32]) -> N
     inside = slice(side // 2, -(side // 2))
     mean, square = (m(image, cv2.CV_64F, (side, side)) for m in (cv2.boxFilter, cv2.sqrBoxFilter))
     variance = cv2.subtract(square, cv2.multiply(mean, mean, dst=mean), dtype=cv2.CV_32F)[inside, inside]
-    spread = np.sqrt(np.maximum(variance, np.float32(_LEAST_VARIANCE)))
+    spread = cv2.sqrt(np.maximum(variance, np.float32(_LEAST_VARIANCE), out=variance))
     return np.asarray(cv2.divide(product, spread, dst=product, scale=1 / (side * float(np.linalg.norm(bare)))))
 
 
