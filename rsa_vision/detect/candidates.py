@@ -7,6 +7,7 @@ trabeculae raise the threshold where they are, and nowhere else). Both polaritie
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
 import cv2
@@ -83,12 +84,14 @@ def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> 
     junctions: list[Float] = []
     strokes: list[Float] = []
     rows = film.shape[0]
+    # kept from band to band: the first touch of new memory costs as much as a filter
+    work = np.empty((5, (min(rows, BAND + 2 * MARGIN) + 16) * (film.shape[1] + 16) // 4), np.float32)
     for start in range(0, rows, BAND):
         top, bottom = max(0, start - MARGIN), min(rows, start + BAND + MARGIN)
         top -= top % 8
         band = film[top:bottom]
         stop = start + BAND if start + BAND < rows else rows + BAND
-        for into, table in zip((found, junctions, strokes), _band_extrema(band, threshold, noise), strict=True):
+        for into, table in zip((found, junctions, strokes), _band_extrema(band, threshold, noise, work), strict=True):
             table[:, 1] += top
             into.append(table[(table[:, 1] >= start) & (table[:, 1] < stop)])
     table = np.concatenate(found)
@@ -96,25 +99,31 @@ def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> 
     return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], np.concatenate(junctions), np.concatenate(strokes))
 
 
-def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tuple[Float, Float, Float]:
+def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work: NDArray[np.float32]) -> tuple[Float, Float, Float]:
+    """``work``: rows with room for the band at half resolution."""
     pad = (-band.shape[0] % 8, -band.shape[1] % 8)
     if any(pad):
         band = cv2.copyMakeBorder(band, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
-    image: NDArray[Any] = cv2.resize(band, (band.shape[1] // 2, band.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+    half = cv2.resize(band, (band.shape[1] // 2, band.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    image, limit, *others = (row[: half.size].reshape(half.shape) for row in work)
+    image[:] = half
+    room = cycle(others)  # three in turn: none is written to from itself
     at, blurred = (1, 0.0), image
     out = [np.zeros((0, 5))]
     junctions, strokes = np.zeros((0, 5)), [np.zeros((0, COLUMNS))]
     for level, inner, outer, radius in SCALES:
         if level > at[0]:
             image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+            limit, *others = (row[: image.size].reshape(image.shape) for row in work[1:])
+            room = cycle(others)
             at, blurred = (level, 0.0), image
         # outer minus inner: positive where the mark is darker than its surroundings
-        begun = _blurred(blurred, at[1], inner)
-        blurred = _blurred(begun, inner, outer)  # the next scale may begin with it
+        begun = _blurred(blurred, at[1], inner, next(room))
+        blurred = _blurred(begun, inner, outer, next(room))  # the next scale may begin with it
         at = (level, outer)
         answer = cv2.subtract(blurred, begun, dst=begun)
         spread = _local_spread(answer, _white_spread(noise, level, inner, outer))
-        limit = cv2.resize(threshold * spread, (answer.shape[1], answer.shape[0]), interpolation=cv2.INTER_LINEAR)
+        limit = cv2.resize(threshold * spread, (answer.shape[1], answer.shape[0]), dst=limit, interpolation=cv2.INTER_LINEAR)
         significance = cv2.divide(answer, limit, dst=limit)
         place = np.flatnonzero((significance > FAINT) | (significance < -FAINT))
         strength = np.asarray(significance.ravel()[place], np.float64)
@@ -127,13 +136,13 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel) -> tu
     return np.concatenate(out), junctions, np.concatenate(strokes)
 
 
-def _blurred(image: NDArray[Any], by: float, sigma: float) -> NDArray[Any]:
+def _blurred(image: NDArray[Any], by: float, sigma: float, into: NDArray[Any]) -> NDArray[Any]:
     """Blur further what is blurred: shorter kernels than from the start."""
     more = float(np.sqrt(sigma**2 - by**2))
     if more == 0:
         return image
     side = 2 * round(REACH * more) + 1
-    return cv2.GaussianBlur(image, (side, side), more)
+    return cv2.GaussianBlur(image, (side, side), more, dst=into)
 
 
 def _extrema(answer: NDArray[Any], place: Int, strength: Float, level: int, radius: float) -> Float:
