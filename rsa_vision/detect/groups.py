@@ -14,7 +14,7 @@ from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, uneven, uneven_white
 from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.patches import columns, cut, weighted_least_squares
+from rsa_vision.detect.patches import columns, cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.profiles import ball_table
 from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Float
@@ -168,8 +168,11 @@ def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float,
     theta = weighted_least_squares(images.linear, weight, data)
     edge = edge_profile(data - images.value.T @ theta[: len(fits.depth)], window.valid, sigma_px)
     residual, jac = data - images.linear @ theta, columns([images.jacobian(theta).T, edge.T])
-    explained = [(weight * residual) @ part @ weighted_least_squares(part, weight, residual) for part in (jac, jac[:, : -edge.shape[1]])]
-    return float(explained[0] - explained[1])
+    weighted = jac * np.sqrt(weight)[:, None]
+    normal, right = weighted.T @ weighted, jac.T @ (weight * residual)
+    plain = slice(jac.shape[1] - edge.shape[1])
+    with_edge, without = (right[part] @ damped_solution(normal[part, part], right[part], 1e-9) for part in (slice(None), plain))
+    return float(with_edge - without)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,8 +39,9 @@ class Painted:
         if cols.size == 0:
             return total
         side = self.images.shape[1]
-        low, high = (np.rint([limit(cols), limit(rows)]) for limit in (np.min, np.max))
-        near = np.flatnonzero(((self.corner_px <= high) & (self.corner_px + side > low)).all(1))
+        (left, right), (top, bottom) = ((round(float(at.min())), round(float(at.max()))) for at in (cols, rows))
+        low, high = np.array([left - side, top - side]), np.array([right, bottom])
+        near = np.flatnonzero(((self.corner_px <= high) & (self.corner_px > low)).all(axis=1))
         place = [np.rint(at).astype(np.intp) for at in (cols, rows)] if len(near) else []
         for k in near:
             col, row = (at - first for at, first in zip(place, self.corner_px[k], strict=True))
