@@ -86,7 +86,7 @@ class Equations:
     def noise_under(self, own: Float, common: Float) -> float:
         """Mean square of what is left under the needles once these changes are made over that beside them, each over what a fit leaves."""
         square = np.square(self.residual - own @ self.own - common @ self.common)
-        leverage = np.einsum("pn,pn->n", self.own, self.inverse @ self.own)
+        leverage = (self.own * (self.inverse @ self.own)).sum(axis=0)
         image = np.abs(np.sum(self.images, axis=0))
         core = image > _CORE * image.max()
         under, beside = (square[where].sum() / (1 - leverage[where]).sum() for where in (core, ~core))

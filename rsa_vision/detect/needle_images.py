@@ -145,7 +145,7 @@ def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, 
 def _table_for(
     width_step: int, length_step: int, taper: float, sigma_px: float, mu_px: float, bend: float
 ) -> tuple[tuple[float, ...], tuple[float, float], tuple[float, float], tuple[float, float]]:
-    """Return the key of the table for needles of about this size, where its grid begins, and, in cells, its middle and how far it is seen."""
+    """Return the key of the table for about this size, where its grid begins and, in cells, its middle and how far it is seen."""
     half_width, length, sigma = round(GRID**width_step, 4), round(GRID**length_step, 4), round(sigma_px, 3)
     first, (n_s, n_p) = _grid(half_width, length, sigma)
     middle, rim = ((n_s - 1) / 2, (n_p - 1) / 2), (_PAD - _FADED) * sigma / CELL
