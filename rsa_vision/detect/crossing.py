@@ -18,7 +18,7 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.whitening import whiten
 from rsa_vision.types import Float, Int
 
-_STEPS, _QUICK_STEPS, _CLOSE_PX = 16, 5, 0.1
+_STEPS, _QUICK_STEPS = 16, 5
 _CONVERGED_PX = 0.02  # a step's change: what is left after it is a tenth of that, and the last fit follows
 _AROUND_PX = 4.0  # beyond three blurs from the arms, which tell the background
 _LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
@@ -169,7 +169,7 @@ def fit_crossing(
             weight = 1.0 / noise.variance_at(theta @ linear + window.beside)
         scale = min(1.0, 1.0 / max(float(np.abs(delta[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(delta[:, -1]).max()), 1e-9))
         now = [_moved(f, scale * d, half) for f, d in zip(now, delta, strict=True)]
-        converged = step > 0 and float(np.abs(delta[:, :2]).max()) < (_CLOSE_PX if quick else _CONVERGED_PX)
+        converged = step > 0 and float(np.abs(delta[:, :2]).max()) < _CONVERGED_PX
     return told()
 
 
