@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.beside import all_but, images_beside
 from rsa_vision.detect.candidates import SCALES, Candidates
 from rsa_vision.detect.decide import LEAST_KNOWN, over_clutter
 from rsa_vision.detect.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.find import distinct, fit_at, plausible, promising
+from rsa_vision.detect.lines import on_lines
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
@@ -76,6 +77,7 @@ def look_again(
         enough = promising(fits, limit, optics.sigma_px, noise) if quick else over_clutter(fits) > _CLEAR * limit
         fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
         place = fits.position_px
+    fits = fits.rows(~on_lines(film, join([balls, fits]), limit, optics, noise, needles)[len(balls.depth) :])
     fits, edged = beside_edges(film, fits, optics, noise, all_but(balls, np.arange(0), optics, needles))
     like = _like_a_ball(fits, limit, noise)
     return fits.rows(like), edged[like]
