@@ -1,4 +1,7 @@
-"""Faint balls that are parts of a wire or an edge: whatever goes straight through a window, with any profile across, explains more."""
+"""Balls and lines: whatever goes straight through a window, with any profile across, as wires and edges do.
+
+Faint balls that a line explains better are parts of it. Balls on and beside lines that are as strong as they are show only beside the line.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,8 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.beside import MOST_IN_GROUP, Background, all_but, groups_of, images_beside
 from rsa_vision.detect.decide import LEAST_KNOWN, heights, look_clear
-from rsa_vision.detect.groups import GroupWindow, edge_profile, fit_group, images_in, window_around
+from rsa_vision.detect.find import no_fits
+from rsa_vision.detect.groups import edge_profile, fit_group, images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import weighted_least_squares
 from rsa_vision.detect.profiles import Optics
@@ -86,22 +90,54 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
         return images_beside(strong, np.arange(0), optics, tees, cols, rows)[0]
 
     for i in np.flatnonzero(~full):
-        one = fits.rows([i])
-        window = window_around(film, one.position_px, one.radius_px, optics.sigma_px, noise, beside)
-        ball = images_in(window, window.surface, one.position_px - window.corner_px, one.radius_px, optics.sigma_px, optics.mu_px)
-        line = edge_profile(window.raw - window.neighbours, window.valid, optics.sigma_px)
-        of_ball, of_line, of_both = _gains(window, [np.concatenate([ball.value, *ball.slopes]).T, line], noise)
+        of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], fits.radius_px[[i]], optics, noise, beside)
         out[i] = of_line > of_ball and of_both - of_line < (_FAR * limit) ** 2
     return out
 
 
-def _gains(window: GroupWindow, parts: list[Float], noise: NoiseModel) -> tuple[float, float, float]:
-    """Return twice the log-likelihood that one, the other and both gain over the background alone."""
+def balls_on_lines(
+    film: NDArray[Any], place_px: Float, radius_px: float, limit: float, optics: Optics, noise: NoiseModel, others: Background
+) -> BallFits:
+    """Fit balls of this size at places that a line explains best, but not all of them.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    place_px : ndarray of shape (n, 2)
+        (col, row).
+    radius_px, limit : float
+    optics : Optics
+    noise : NoiseModel
+    others : callable
+        Images of all that is known.
+
+    Returns
+    -------
+    BallFits
+        With the line in their background, several perhaps of one ball.
+    """
+    parts = []
+    for at in place_px:
+        start = at[None], np.array([radius_px])
+        of_ball, of_line, of_both = _gains(film, *start, optics, noise, others)
+        if of_line > of_ball and of_both - of_line > (_FAR * limit) ** 2:
+            parts.append(fit_group(film, *start, optics.sigma_px, optics.mu_px, noise, others, edge=True))
+    return join(parts) if parts else no_fits()
+
+
+def _gains(
+    film: NDArray[Any], at_px: Float, radius_px: Float, optics: Optics, noise: NoiseModel, others: Background
+) -> tuple[float, float, float]:
+    """Return twice the log-likelihood that a ball, a line, and both gain over a background alone, to first order."""
+    window = window_around(film, at_px, radius_px, optics.sigma_px, noise, others)
+    images = images_in(window, window.surface, at_px - window.corner_px, radius_px, optics.sigma_px, optics.mu_px)
+    ball = np.concatenate([images.value, *images.slopes]).T
+    line = edge_profile(window.raw - window.neighbours, window.valid, optics.sigma_px)
     root = np.sqrt(window.valid / noise.variance_at(window.raw))
-    basis = np.column_stack([window.surface, *parts, window.raw - window.neighbours])
+    basis = np.column_stack([window.surface, ball, line, window.raw - window.neighbours])
     white = whiten_rows((basis * root[:, None]).T, window.size, noise)
     data, even = white[-1], np.ones(window.size**2)
-    of = np.repeat([0, 1, 2], [window.surface.shape[1], parts[0].shape[1], parts[1].shape[1]])
+    of = np.repeat([0, 1, 2], [window.surface.shape[1], ball.shape[1], line.shape[1]])
 
     def explained(*which: int) -> float:
         some = white[:-1][np.isin(of, which)].T
