@@ -18,6 +18,7 @@ from rsa_vision.detect.groups import edge_profile, fit_group, images_in, window_
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import weighted_least_squares
 from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Bool, Float
 
@@ -64,6 +65,7 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
     """Say which faint balls a line explains better, and add little to it.
 
     Both are judged by likelihood, in noise made white. A ball on a wire is more than the wire: it keeps its significance beside any profile.
+    The end of a wire keeps some as well, but goes on beyond its rim.
 
     Parameters
     ----------
@@ -86,12 +88,14 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
     full = height > _FAINT * np.median(height[clear])
     strong = fits.rows(full)
 
-    def beside(cols: Float, rows: Float) -> Float:
-        return images_beside(strong, np.arange(0), optics, tees, cols, rows)[0]
+    def beside(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+        return images_beside(strong, np.arange(0), optics, tees, cols, rows)
 
+    others = all_but(strong, np.arange(0), optics, tees)
     for i in np.flatnonzero(~full):
-        of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], fits.radius_px[[i]], optics, noise, beside)
-        out[i] = of_line > of_ball and of_both - of_line < (_FAR * limit) ** 2
+        of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], fits.radius_px[[i]], optics, noise, others)
+        if of_line > of_ball:
+            out[i] = of_both - of_line < (_FAR * limit) ** 2 or goes_on(film, fits.rows([i]), np.array([i]), beside, optics.sigma_px)[0]
     return out
 
 
