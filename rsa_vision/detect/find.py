@@ -159,7 +159,7 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
         In the order of the candidates; several may have come to the same place.
     """
     if len(candidates.radius_px) == 0:
-        return _no_fits()
+        return no_fits()
     sizes, size = np.unique(candidates.radius_px, return_inverse=True)
     parts = []
     for k, radius in enumerate(sizes):
@@ -221,6 +221,7 @@ def significance_limit(film_size: int, radius_px: float, false_detections: float
     return limit
 
 
-def _no_fits() -> BallFits:
+def no_fits() -> BallFits:
+    """Return an empty table."""
     none = np.zeros(0)
     return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), *(none,) * 10, np.zeros(0, bool))

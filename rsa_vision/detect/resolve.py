@@ -18,6 +18,7 @@ from rsa_vision.detect.decide import LEAST_KNOWN, hopeless, look_clear
 from rsa_vision.detect.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.groups import fit_group
+from rsa_vision.detect.lines import without_lines
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
@@ -122,7 +123,8 @@ def resolve_balls(
     found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
     found = resolve_crowds(film, candidates, distinct(found, noise), optics, noise, tees)
     found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
-    found, edged = beside_edges(film, distinct(found, noise), optics, noise, tees)
+    found = without_lines(film, distinct(found, noise), limit, optics, noise, tees)
+    found, edged = beside_edges(film, found, optics, noise, tees)
     balls = plausible(found, noise)
     found, edged = found.rows(balls), edged[balls]
     by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.beside import all_but, images_beside
 from rsa_vision.detect.candidates import SCALES, Candidates
-from rsa_vision.detect.decide import LEAST_KNOWN, over_clutter
+from rsa_vision.detect.decide import LEAST_KNOWN, look_clear, over_clutter
 from rsa_vision.detect.edges import NEAR_EDGES, beside_edges
-from rsa_vision.detect.find import distinct, fit_at, plausible, promising
+from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, no_fits, plausible, promising
+from rsa_vision.detect.lines import balls_on_lines, on_lines
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
@@ -27,6 +28,7 @@ _CLEAR = 0.9  # of the limit, over clutter
 _FAR, _SLACK = 1.5, 1.4  # times the limit, times the misfit that is tolerated otherwise
 _ROUND = 0.4  # the filter that suits the usual size answers balls of it by round extrema
 _SIZE = 1.6  # ratio of the fitted radius to the usual one
+_OF_SIZE = 1.25  # the same to that of any clear ball, where lines are what is seen first
 
 
 def look_again(
@@ -68,17 +70,41 @@ def look_again(
     def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
         return images_beside(balls, np.arange(0), optics, needles, cols, rows)
 
+    left_over = place
     for quick in (True, False):
-        if len(place) == 0:
-            return none
-        fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick)
+        fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick) if len(place) else no_fits()
         stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
         enough = promising(fits, limit, optics.sigma_px, noise) if quick else over_clutter(fits) > _CLEAR * limit
         fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
         place = fits.position_px
+    fits = fits.rows(~on_lines(film, join([balls, fits]), limit, optics, noise, needles)[len(balls.depth) :])
     fits, edged = beside_edges(film, fits, optics, noise, all_but(balls, np.arange(0), optics, needles))
     like = _like_a_ball(fits, limit, noise)
-    return fits.rows(like), edged[like]
+    fits, edged = fits.rows(like), edged[like]
+    known = join([balls, fits])
+    over = _over_lines(film, left_over[~_near(left_over, known, usual)], known, usual, limit, optics, noise, needles)
+    return join([fits, over]), np.append(edged, np.ones(len(over.depth), bool))
+
+
+def _over_lines(
+    film: NDArray[Any],
+    place: Float,
+    known: BallFits,
+    usual: float,
+    limit: float,
+    optics: Optics,
+    noise: NoiseModel,
+    needles: Painted | None,
+) -> BallFits:
+    """Balls that are seen only beside the line that they lie on: of the sizes that are known, sure, and well described."""
+    others = all_but(known, np.arange(0), optics, needles)
+    fits = balls_on_lines(film, place, usual, limit, optics, noise, others)
+    fits = distinct(fits.rows(inside(fits, film) & ~_near(fits.position_px, known, usual) & plausible(fits, noise, NEAR_EDGES)), noise)
+    fits, edged = beside_edges(film, fits, optics, noise, others)
+    clear = known.radius_px[look_clear(known, noise)]
+    size = np.abs(np.log(fits.radius_px[:, None] / clear)).min(axis=1, initial=np.inf) < np.log(_OF_SIZE)
+    close = plausible(fits, noise) & (misfit(fits, noise) < DOUBTFUL * MISFIT)
+    return fits.rows(edged & size & close & (over_clutter(fits) > max(SURE, limit)))
 
 
 def _like_a_ball(fits: BallFits, limit: float, noise: NoiseModel, slack: float = _SLACK) -> Bool:

@@ -1,0 +1,60 @@
+"""Wires in correlated noise are no rows of faint balls, and balls that lie on them keep their places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsa_vision.detect import detect_markers
+from rsa_vision.types import Float
+
+from .films import film_of_balls, grid_of_balls, stored, strip
+
+SIDE, SIGMA_PX, RADIUS_PX = 760, 1.4, 4.0
+DEPTH, CNR, NOISE_BLUR_PX = 0.45, 15.0, 0.8
+BACKGROUND = 30000.0
+FILMS = 3
+MOST_FALSE, LEAST_FOUND = 2, 0.95  # of a film with 32 wires; there were 9 to 13
+FAR = 4.5
+
+
+def film_with_wires(rng: np.random.Generator, faint: float = 0.0) -> tuple[Float, Float]:
+    """Return a film of balls, most of them on or beside a wire as wide as they are, and the centres of the balls.
+
+    ``faint``: every third ball lies on no wire and has so much of the contrast.
+    """
+    truth, radius = grid_of_balls(rng, 7, 100.0, (RADIUS_PX, RADIUS_PX))
+    bare = np.arange(len(truth)) % 3 == 0
+    depth = np.where(bare & (faint > 0), faint * DEPTH, DEPTH)
+    film = film_of_balls((SIDE, SIDE), truth, radius, background=BACKGROUND, depth=depth, sigma_px=SIGMA_PX)
+    for place in truth[~bare]:
+        angle, off = rng.uniform(0, np.pi), rng.uniform(-1.5, 1.5) * RADIUS_PX
+        along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        middle = place + off * across
+        wire = strip((SIDE, SIDE), middle - 45 * along, middle + 45 * along, 1.4 * RADIUS_PX, SIGMA_PX)
+        film = film * (1 - rng.uniform(0.1, 0.4) * wire)
+    flat = np.zeros((0, 2)), np.zeros(0)
+    noise = film_of_balls((SIDE, SIDE), *flat, background=0.0, noise_sd=BACKGROUND * DEPTH / CNR, noise_blur_px=NOISE_BLUR_PX, rng=rng)
+    return film + noise, truth
+
+
+@pytest.mark.parametrize("seed", range(FILMS))
+def test_wires_are_no_rows_of_balls(seed: int) -> None:
+    film, truth = film_with_wires(np.random.default_rng(40 + seed))
+    images = detect_markers(stored(film), bits=16).images
+    gap = np.hypot(*(truth[:, None] - images.position_px[None]).transpose(2, 0, 1))
+    index, near = gap.argmin(axis=1), gap.min(axis=1) < 2.0
+    false = images.position_px[gap.min(axis=0) >= 2.0]
+    error = images.position_px[index[near]] - truth[near]
+    square = np.einsum("ni,ni->n", error, np.linalg.solve(images.covariance_px2[index[near]], error[:, :, None])[:, :, 0])
+    print(f"{near.sum()} of {len(truth)}, {len(false)} false, farthest {np.sqrt(square.max()):.1f} sd")
+    assert near.sum() >= LEAST_FOUND * len(truth)
+    assert len(false) <= MOST_FALSE, false
+    assert np.sqrt(square.max()) < FAR
+
+
+def test_faint_balls_beside_them_stay() -> None:
+    film, truth = film_with_wires(np.random.default_rng(50), faint=0.4)
+    found = detect_markers(stored(film), bits=16).images.position_px
+    gap = np.hypot(*(truth[::3, None] - found[None]).transpose(2, 0, 1)).min(axis=1)
+    assert (gap < 1.5).all(), truth[::3][gap >= 1.5]
