@@ -64,7 +64,7 @@ def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Opti
 def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, tees: Background | None) -> Bool:
     """Say which faint balls a line explains better, and add little to it.
 
-    Both are judged by likelihood, in noise made white. A ball on a wire is more than the wire: it keeps its significance beside any profile.
+    Both are judged by likelihood, in noise made white. A ball on a wire is more than that: it keeps its significance beside any profile.
     The end of a wire keeps some as well, but goes on beyond its rim.
 
     Parameters
