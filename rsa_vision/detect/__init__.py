@@ -29,11 +29,11 @@ from rsa_vision.detect.find import (
     plausible,
     significance_limit,
 )
-from rsa_vision.detect.leftover import noise_under
+from rsa_vision.detect.leftover import noise_at_marks, noise_under
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
-from rsa_vision.detect.optics import ball_evidence, estimate_optics, first_noise_under
+from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
@@ -108,8 +108,8 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     pins = look_for_pins(values, candidates.strokes, noise)
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
-        _one_polarity(values, bits, sign, optics, seeds, pins, candidates, faint, of_marks, limit)
-        for sign, optics, of_marks in _polarities(values, signs, seeds, pins, candidates, noise)
+        _one_polarity(values, bits, sign, optics, mine, pins, candidates, faint, of_marks, limit)
+        for sign, optics, mine, of_marks in _polarities(values, signs, seeds, pins, candidates, noise)
     ]
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
@@ -117,12 +117,10 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
 def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> tuple[BallFits, list[int]]:
     """First looks, and the signs of depth that were looked at: one where the strongest candidates leave no doubt which is the markers'."""
     candidates = candidates.rows(candidates.roundness > ROUNDNESS)
-    slim = [p for p in pins if is_slim(p)]
     sign = -np.sign(candidates.strength)
 
     def look(index: Any) -> BallFits:
-        fits = first_look(film, candidates.rows(index), noise)
-        return fits.rows(~on_pins(fits.position_px, 1 - fits.explained, slim))
+        return _look(film, candidates.rows(index), pins, noise)
 
     strongest = {this: np.flatnonzero(sign == this)[:_STRONGEST] for this in (-1, 1)}
     looks = {this: look(index) for this, index in strongest.items()}
@@ -138,6 +136,11 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
     return distinct(join([*looks.values(), look(rest)]), noise), list(looks)
 
 
+def _look(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> BallFits:
+    fits = first_look(film, candidates, noise)
+    return fits.rows(~on_pins(fits.position_px, 1 - fits.explained, [p for p in pins if is_slim(p)]))
+
+
 def _of_tees(candidates: Candidates, sign: int) -> float:
     """Evidence of junctions for tees of one polarity."""
     return float(np.clip(-sign * candidates.junctions[:, 4] - CLEAR_JUNCTION, 0.0, 20.0).sum())
@@ -145,12 +148,16 @@ def _of_tees(candidates: Candidates, sign: int) -> float:
 
 def _polarities(
     film: NDArray[Any], signs: list[int], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
-) -> list[tuple[int, Optics, NoiseModel]]:
-    """Signs of depth worth looking at, with their optics and noise; both only where neither is clearly the markers'."""
-    weight, optics, noises = {-1: 0.0, 1: 0.0}, {}, {}
+) -> list[tuple[int, Optics, BallFits, NoiseModel]]:
+    """Signs of depth worth looking at, with their optics, first looks and noise; both only where neither is clearly the markers'."""
+    weight, optics, looks, noises = {-1: 0.0, 1: 0.0}, {}, {}, {}
     for sign in signs:
         mine = seeds.rows(np.sign(seeds.depth) == sign)
-        noises[sign] = replace(noise, under=first_noise_under(film, mine, noise))
+        noises[sign] = noise_at_marks(film, mine, noise)
+        if noises[sign] is not noise:  # not all that was unlike a ball in less noise is none
+            round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
+            mine = distinct(_look(film, round_ones, pins, noises[sign]), noises[sign])
+        looks[sign] = mine
         optics[sign], balls = estimate_optics(film, mine, noises[sign])
         strength = -sign * candidates.junctions[:, 4]
         clear = strength > CLEAR_JUNCTION
@@ -164,7 +171,7 @@ def _polarities(
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and len(seeds.depth) == 0:
         return []
-    return [(sign, optics[sign], noises[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
+    return [(sign, optics[sign], looks[sign], noises[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
 
 
 def _one_polarity(
@@ -179,7 +186,6 @@ def _one_polarity(
     noise: NoiseModel,
     limit: float,
 ) -> tuple[float, Detection]:
-    seeds = seeds.rows(np.sign(seeds.depth) == sign)
     junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
     mine = replace(candidates.rows(np.sign(candidates.strength) == -sign), junctions=junctions)
     tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
@@ -260,8 +266,8 @@ def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
 
 def _what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Float, Bool]:
     """Return the misfit of each ball, and which are not described well."""
-    under = replace(balls, chi2_core=balls.chi2_core / max(usual, noise.under))  # noise that all balls have under them is no misfit of one
-    left = misfit(under, replace(noise, under=1.0), CHANCE)
+    under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
+    left = misfit(under, noise, CHANCE)
     return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE)
 
 

@@ -53,8 +53,9 @@ class BallFits:
     background : ndarray of shape (n,)
         Background value at the centre.
     significance : ndarray of shape (n,)
-        Depth over its standard deviation at the fitted centre and radius: radius and depth of a ball that is small against the blur can
-        stand for each other, so that neither is sure alone; that something is there is. Of a sparse look, what all pixels promise.
+        Depth over its standard deviation (by noise as beside it, where there is more under it) at the fitted centre and radius: radius and
+        depth of a ball that is small against the blur can stand for each other, so that neither is sure alone; that something is there is.
+        Of a sparse look, what all pixels promise.
     n_core : ndarray of shape (n,)
         Pixels under the ball that were looked at.
     converged : ndarray of bool, shape (n,)
@@ -224,6 +225,10 @@ def fit_balls(
         all_left, all_weight = residual.take(pixels.back, axis=1), weight.take(pixels.back, axis=1)
         chi2_ring = uneven(all_left, all_weight, local, size, ~under)
         chi2_uneven = uneven_white(all_left, all_weight, local, size, under, noise)
+    # noise alone, which significance is against, is that of the background where there is more under a ball
+    background = equations.background(seen, depth)[:, 0] + level[:, 0]
+    told = np.square(seen[:, 3])
+    alone = (told * valid[:, :reached]).sum(1) / noise.variance_at(background) / np.maximum((told * weight[:, :reached]).sum(1), 1e-30)
     return BallFits(
         position_px=local + patches.corner_px,
         radius_px=radius,
@@ -236,8 +241,8 @@ def fit_balls(
         valid_fraction=counted / np.maximum(core.sum(1), 1),
         window_fraction=valid.sum(1, dtype=np.float64) / own.sum(1),
         log_likelihood=-0.5 * total,
-        background=equations.background(seen, depth)[:, 0] + level[:, 0],
-        significance=np.abs(depth) / np.sqrt(np.maximum(variance, 1e-30)),
+        background=background,
+        significance=np.abs(depth) / np.sqrt(np.maximum(variance / np.maximum(alone, 1.0), 1e-30)),
         n_core=core_n,
         converged=converged,
     )
@@ -268,7 +273,7 @@ def mirrored(local: Float, size: int) -> Int:
     twice = np.rint(2 * local).astype(np.intp)
     axis = np.arange(size)
     cols, rows = np.clip(twice[:, :1] - axis, 0, size - 1), np.clip(twice[:, 1:] - axis, 0, size - 1)
-    return np.asarray((rows[:, :, None] * size + cols[:, None, :]).reshape(len(local), -1))
+    return np.asarray((rows[:, :, None] * size + cols[:, None, :]).reshape(len(local), size * size))
 
 
 def uneven_white(residual: Float, weight: Float, local: Float, size: int, core: Bool, noise: NoiseModel) -> Float:

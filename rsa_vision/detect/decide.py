@@ -53,7 +53,7 @@ def hopeless(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < LEAST_KNOWN:
         return np.zeros(len(pattern), bool)
-    height = heights(fits, sigma_px)
+    height = height_of(fits, sigma_px)
     faint = (height < UNEXCUSED * np.median(height[pattern])) & (fits.explained < EXPLAINED)
     unlike = ~_near_in_size(fits, radii) | (misfit(fits, noise) > 2 * MISFIT)
     over_noise = height / np.sqrt(noise.variance_at(fits.background))
@@ -95,7 +95,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     # what would be larger still than the fit may go is no ball of that size
     sure = (strength > max(SURE, limit)) & ~spot & (fits.radius_px < RADIUS_PX[1])
     close = misfit(fits, noise) < MISFIT
-    height = heights(fits, sigma_px)
+    height = height_of(fits, sigma_px)
     pattern = _not_faint(sure & close & (fits.explained > CLOSE), height)
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < LEAST_KNOWN:
@@ -145,6 +145,6 @@ def _of_like_spread(spread: Float, among: Bool) -> Float:
     return np.asarray((np.abs(np.log(spread[:, None] / spread[among])) < np.log(_LIKE)).sum(axis=1))
 
 
-def heights(fits: BallFits, sigma_px: float) -> Float:
-    """Return the heights of the blurred images, roughly, in film values; shape (n,)."""
+def height_of(fits: BallFits, sigma_px: float) -> Float:
+    """Return the heights of the blurred images, roughly, shape (n,)."""
     return np.asarray(np.abs(fits.depth) * -np.expm1(-0.5 * (fits.radius_px / sigma_px) ** 2))

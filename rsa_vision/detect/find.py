@@ -87,8 +87,8 @@ def misfit(fits: BallFits, noise: NoiseModel, chance: float = 0.0) -> Float:
 
     ``chance``: what is within so many standard deviations of the mean square of noise alone does not count.
     """
-    excess = np.maximum(fits.chi2_core - noise.under, 0.0)
-    excess = np.where(excess > chance * noise.under * noise.scatter(fits.n_core), excess, 0.0) * noise.variance_at(fits.background)
+    excess = np.maximum(fits.chi2_core - 1.0, 0.0)
+    excess = np.where(excess > chance * noise.scatter(fits.n_core), excess, 0.0) * noise.variance_at(fits.background)
     rest: Float = np.sqrt(excess) / np.maximum(np.abs(fits.depth), 1e-9)
     return rest
 
@@ -113,8 +113,13 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
     least = 1 - (1 - EXPLAINED) * slack
     stands_out = fits.significance / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
-    explained = (fits.explained > least) | ((explained_over_noise(fits, noise.under) > least) & stands_out)
+    explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
     return usable & (misfit(fits, noise, CHANCE) < MISFIT * slack) & explained & (fits.significance > 5.0)
+
+
+def in_correlated_noise(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Float:
+    """Return the significance of quick fits, which is that in white noise, less what the correlation of the noise takes from it, (n,)."""
+    return np.asarray(fits.significance / np.sqrt(noise.gain(np.hypot(sigma_px, 0.5 * fits.radius_px))))
 
 
 def promising(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:
@@ -133,15 +138,15 @@ def promising(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     -------
     ndarray of bool, shape (n,)
     """
-    return np.asarray(fits.significance > PROMISING * limit * np.sqrt(noise.gain(np.hypot(sigma_px, 0.5 * fits.radius_px))))
+    return np.asarray(in_correlated_noise(fits, sigma_px, noise) > PROMISING * limit)
 
 
-def explained_over_noise(fits: BallFits, under: float) -> Float:
-    """Return the part of the excess over the noise under each ball (in units of that beside it) that the ball explains, shape (n,)."""
+def explained_over_noise(fits: BallFits) -> Float:
+    """Return the part of the excess over the noise under each ball that the ball explains, shape (n,)."""
     left = fits.chi2_core
     raised = left / np.maximum(1.0 - fits.explained, 1e-9)
-    out: Float = 1.0 - np.maximum(left - under, 0.0) / np.maximum(raised - under, 1e-9)
-    return np.where(raised > under, out, 0.0)
+    out: Float = 1.0 - np.maximum(left - 1.0, 0.0) / np.maximum(raised - 1.0, 1e-9)
+    return np.where(raised > 1.0, out, 0.0)
 
 
 def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) -> BallFits:

@@ -1,13 +1,19 @@
-"""What fits leave under balls, against what the same fits leave of free places: the noise under marks, which no tile of a film tells."""
+"""What fits leave under balls, against what there is at free places: the noise under marks, which no tile of a film tells."""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from rsa_vision.detect.balls import derivatives, half_size
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls import BallFits, ball_image, derivatives, half_size, mirrored
+from rsa_vision.detect.decide import height_of, over_clutter
+from rsa_vision.detect.find import COARSE_SIGMA_PX, SURE, fit_at, guessed_optics
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.surroundings import Places
+from rsa_vision.detect.surroundings import Places, free_places
 from rsa_vision.detect.whitening import whiten
 from rsa_vision.types import Bool, Float
 
@@ -17,6 +23,84 @@ _OUTLIER = 3.0  # times the median
 LEAST = 8  # marks, and places, that tell something
 _NOTHING = 0.01  # places leave less only where there is no noise
 _MOST = 0.4, 2.5  # what they may tell
+_WHOLE, _INSIDE = 0.95, 0.8  # of the pixels under a ball, and of its window
+_ASKED = 24  # sure candidates
+_QUARTILE = 0.25  # that tells: what is no ball leaves more
+_MORE = 1.3  # times the variance under them that is none by chance, and worth it
+_DOUBLINGS = np.linspace(0.0, 5.0, 21)  # of the variance: hardly anything comes through the middle of a ball where nothing is scattered
+_FARTHEST, _FAR = 0.75, 0.5  # quantile of how far balls reach beyond the curve, and part of it from which they tell how it goes on
+
+
+def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> NoiseModel:
+    """Return the noise with its curve carried on to the values under marks, as the film's sure candidates tell it.
+
+    Where a film records the logarithm of the exposure, or anything as steep, the fewer quanta under marks make more noise than there is at
+    any background. It is told by the odd part of second differences: a wrong blur leaves nothing odd, bone hardly any differences, and
+    neither does what a fit takes up. The lower quartile of candidates and of free places are compared, since what is no ball leaves more.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    seeds : BallFits
+        First looks of one polarity.
+    noise : NoiseModel
+
+    Returns
+    -------
+    NoiseModel
+        The same where too few tell, and where there is no more noise.
+    """
+    clear = over_clutter(seeds) > SURE * np.sqrt(noise.gain(np.hypot(COARSE_SIGMA_PX, 0.5 * seeds.radius_px)))
+    sure = seeds.rows(clear & (seeds.valid_fraction > _WHOLE) & (seeds.window_fraction > _INSIDE))
+    if len(sure.depth) < LEAST:
+        return noise
+    guess = guessed_optics(float(np.median(sure.radius_px)))
+    sign = np.sign(sure.depth[0])
+    end = noise.level[-1 if sign > 0 else 0]
+    reach = sign * (sure.background - end) + height_of(sure, guess.sigma_px)
+    farthest = float(np.quantile(reach, _FARTHEST))
+    sure = sure.rows(reach > _FAR * farthest)
+    sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
+    if farthest <= 0 or len(sure.depth) < LEAST:
+        return noise
+    places = free_places(film, sure, seeds.position_px, seeds.radius_px + guess.sigma_px, guess, noise)
+    reach_px = float(np.median(sure.radius_px)) + guess.sigma_px
+    beside = np.concatenate([_ripple(t.values, noise.variance_at(t.values.mean(axis=1))[:, None], None, reach_px) for t in places])
+    if len(beside) < LEAST:
+        return noise
+    fits = fit_at(film, sure.position_px, sure.radius_px, guess, noise, quick=True)
+    half = half_size(float(fits.radius_px.max()), guess.sigma_px)
+    patches = cut(film, fits.position_px, half, noise)
+    rows, cols = np.mgrid[0 : patches.size, 0 : patches.size].reshape(2, 1, -1)
+    local = fits.position_px - patches.corner_px
+    image = fits.depth[:, None] * ball_image(cols - local[:, :1], rows - local[:, 1:], fits.radius_px, guess.sigma_px, guess.mu_px)
+    left, model = patches.values.reshape(image.shape) - image, fits.background[:, None] + image
+
+    def more(doublings: float) -> float:
+        trial = noise.carried_on(end + sign * farthest, 2.0**doublings)
+        return float(np.quantile(_ripple(left, trial.variance_at(model), local, fits.radius_px + guess.sigma_px), _QUARTILE))
+
+    usual = float(np.quantile(beside, _QUARTILE))
+    if more(0.0) < _MORE * usual:
+        return noise
+    doublings = np.interp(-usual, [-more(d) for d in _DOUBLINGS], _DOUBLINGS)
+    return noise.carried_on(end + sign * farthest, 2.0**doublings)
+
+
+def _ripple(windows: NDArray[Any], variance: Float, centre: Float | None, reach_px: Float | float) -> Float:
+    """Mean square of the odd part of second differences around centres (of the windows, if not given) in units of the variance, (n,)."""
+    n, side = len(windows), round(np.sqrt(windows.shape[1]))
+    centre = np.full((n, 2), side // 2) if centre is None else centre
+    square = windows.reshape(n, side, side).astype(np.float64)
+    bent = np.zeros(square.shape)
+    bent[:, 1:-1, 1:-1] = 4 * square[:, 1:-1, 1:-1]
+    for near in (np.s_[:, :-2, 1:-1], np.s_[:, 2:, 1:-1], np.s_[:, 1:-1, :-2], np.s_[:, 1:-1, 2:]):
+        bent[:, 1:-1, 1:-1] -= square[near]
+    bent_rows = bent.reshape(windows.shape) / np.sqrt(variance)
+    odd = bent_rows - np.take_along_axis(bent_rows, mirrored(centre, side), 1)
+    rows, cols = np.mgrid[0:side, 0:side].reshape(2, 1, -1)
+    core = np.hypot(cols - centre[:, :1], rows - centre[:, 1:]) < np.broadcast_to(reach_px, n)[:, None]
+    return np.asarray((core * odd**2).sum(axis=1) / core.sum(axis=1))
 
 
 def noise_under(uneven: Float, radius_px: Float, quiet: float, places: list[Places], optics: Optics, noise: NoiseModel) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.beside import MOST_IN_GROUP, Background, all_but, groups_of, images_beside
-from rsa_vision.detect.decide import LEAST_KNOWN, heights, look_clear
+from rsa_vision.detect.decide import LEAST_KNOWN, height_of, look_clear
 from rsa_vision.detect.find import no_fits
 from rsa_vision.detect.groups import edge_profile, fit_group, images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
@@ -82,7 +82,7 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
     ndarray of bool, shape (n,)
         None where too few balls are clear.
     """
-    out, height, clear = np.zeros(len(fits.depth), bool), heights(fits, optics.sigma_px), look_clear(fits, noise)
+    out, height, clear = np.zeros(len(fits.depth), bool), height_of(fits, optics.sigma_px), look_clear(fits, noise)
     if np.count_nonzero(clear) < LEAST_KNOWN:
         return out
     full = height > _FAINT * np.median(height[clear])

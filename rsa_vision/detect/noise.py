@@ -24,6 +24,7 @@ _MUCH, _SPECKS = 0.2, 0.2  # part of a film that its background is, part of the 
 _ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many times as many as there are within the fourth of such
 _TAIL = 16  # such distances are less than this part of the values
 _LEVELS = 12  # value classes of the variance curve
+_BEYOND = 12  # points by which it is carried on
 _QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
 _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
 _ROUNDED = 0.1  # of that: less is left by no noise
@@ -42,8 +43,6 @@ class NoiseModel:
         Correlation of pixels at (row, col) offsets -LAGS..LAGS; 1 in the middle.
     floor, ceiling : float
         Values at or beyond them are saturated and carry no information.
-    under : float
-        Variance under marks, in units of that beside them, where more is known than the curve tells.
     """
 
     level: Float
@@ -51,11 +50,22 @@ class NoiseModel:
     correlation: Float
     floor: float
     ceiling: float
-    under: float = 1.0
 
     def variance_at(self, values: Float) -> Float:
         """Return the variance of pixels with these expected values (same shape)."""
         return np.interp(values, self.level, self.variance)
+
+    def carried_on(self, value: float, variance: float) -> NoiseModel:
+        """Return the same noise with its curve carried on beyond its end to a value and the variance there, in units of that at the end.
+
+        Evenly in the logarithm: where a film records the logarithm of the exposure, the variance by quanta is inverse to the exposure.
+        """
+        up = value > self.level[-1]
+        level = np.linspace(self.level[-1 if up else 0], value, _BEYOND + 1)[1:]
+        beyond = self.variance[-1 if up else 0] * variance ** (np.arange(1, _BEYOND + 1) / _BEYOND)
+        if up:
+            return replace(self, level=np.append(self.level, level), variance=np.append(self.variance, beyond))
+        return replace(self, level=np.append(level[::-1], self.level), variance=np.append(beyond[::-1], self.variance))
 
     def scatter(self, pixels: Float) -> Float:
         """Return the standard deviation of the mean square of the noise in so many pixels beside each other, in units of the variance.

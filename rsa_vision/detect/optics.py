@@ -10,23 +10,22 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
 from rsa_vision.detect.balls import BallFits, ball_image, slopes
-from rsa_vision.detect.decide import over_clutter
 from rsa_vision.detect.find import (
     COARSE_MU_PX,
     COARSE_SIGMA_PX,
-    DOUBTFUL,
     EXPLAINED,
     MISFIT,
     SURE,
+    explained_over_noise,
     fit_at,
-    guessed_optics,
+    in_correlated_noise,
     misfit,
     refine,
 )
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
-from rsa_vision.types import Float
+from rsa_vision.types import Float, Int
 
 SIGMAS_PX = (0.55, 0.75, 1.05, 1.5, 2.1, 2.9)
 KAPPA = 0.5  # attenuation along one blur width while the blur is looked for
@@ -45,8 +44,7 @@ _WHOLE, _PARTLY, _INSIDE = 0.98, 0.8, 0.8  # of the pixels under a ball, and of 
 _SPECKS = 0.5  # of the capped significance of the best
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
-_ENOUGH, _ASKED = 8, 24  # sure candidates that tell the noise under marks; more are not asked
-_MORE, _MOST = 1.3, 4.0  # variance under them that is looked into, and that they may tell
+_MUCH_MORE = 1.5  # times the variance
 _CAP = 50.0  # significance beyond which a ball is no better evidence
 
 
@@ -55,37 +53,6 @@ def ball_evidence(fits: BallFits, noise: NoiseModel) -> float:
     rest = np.maximum(misfit(fits, noise) / MISFIT, (1 - fits.explained) / (1 - EXPLAINED))
     whole = (fits.valid_fraction > 0.95) & (fits.window_fraction > 0.8)
     return float((np.minimum(fits.significance, _CAP) * np.exp(-((rest / _SHARP) ** 2)))[whole].sum())
-
-
-def first_noise_under(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> float:
-    """Return the variance under marks in units of that beside them, as the film's sure candidates tell it before its optics are known.
-
-    Where a film records the logarithm of the exposure, or anything as steep, the fewer quanta under marks make more noise than there is at
-    any background: large balls are as unlike their models then as what is no ball. Only the odd part of what fits leave counts, of which
-    a wrong blur has none, over that of the structure around; and the lower quartile, since what is no ball leaves more.
-
-    Parameters
-    ----------
-    film : ndarray of shape (rows, cols)
-    seeds : BallFits
-        Of one polarity.
-    noise : NoiseModel
-
-    Returns
-    -------
-    float
-        One where too few tell, where there is less, and where the difference is no matter.
-    """
-    sure = seeds.rows((over_clutter(seeds) > SURE) & (seeds.valid_fraction > _WHOLE) & (seeds.window_fraction > _INSIDE))
-    sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
-    if len(sure.depth) < _ENOUGH or np.quantile(sure.chi2_core, 0.25) < _MORE:
-        return 1.0
-    clear = np.median(np.abs(sure.depth) / np.sqrt(noise.variance_at(sure.background)))
-    if np.sqrt(_MOST - 1) < DOUBTFUL * MISFIT * clear:
-        return 1.0
-    guess = guessed_optics(float(np.median(sure.radius_px)))
-    fits = fit_at(film, sure.position_px, sure.radius_px, guess, noise.as_white())
-    return float(np.clip(np.quantile(fits.chi2_uneven / np.maximum(fits.chi2_ring, 1.0), 0.25), 1.0, _MOST))
 
 
 def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> tuple[Optics, float]:
@@ -111,7 +78,8 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     clear, partly = (inside & (seeds.valid_fraction > least) for least in (_WHOLE, _PARTLY))
     if partly.any():
         seeds = seeds.rows(clear if strength[clear].max(initial=0.0) > _SPECKS * strength[partly].max() else partly)
-    best = np.argsort(_closeness(seeds, noise))[:_MOST_TRIED]
+    noisy = _much_more_noise(seeds, noise)
+    best = np.argsort(_closeness(seeds, noise, noisy))[:_MOST_TRIED]
     position, radius = seeds.position_px[best], seeds.radius_px[best]
 
     def fit(sigma: float, kappa: float) -> BallFits:
@@ -119,18 +87,24 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
 
     # whatever fits badly at every blur is no ball and has no say
     trials = [fit(sigma, KAPPA) for sigma in SIGMAS_PX]
-    closest = np.min([_closeness(t, noise) for t in trials], axis=0)
+    closest = np.min([_closeness(t, noise, noisy) for t in trials], axis=0)
     chosen = np.argsort(closest)[:_MOST_SEEDS]
     chosen = chosen[closest[chosen] < max(0.08, 1.5 * closest[chosen[0]])]
+    known = np.minimum(in_correlated_noise(seeds.rows(best), COARSE_SIGMA_PX, noise), _CAP) / _CAP
+    say = known**2 if noisy else np.ones(len(best))  # specks say little of the blur
+
+    def likeliest(these: Int) -> float:
+        return refine(SIGMAS_PX, [_cost(t.rows(these), say[these]) for t in trials])
+
     position, radius = position[chosen], radius[chosen]
-    sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen)) for t in trials])
+    sigma = likeliest(chosen)
     # what came close at another blur only, as two balls in one at a wide one, is none of the film's balls
     fits = fit(sigma, KAPPA)
-    close = _closeness(fits, noise)
+    close = _closeness(fits, noise, noisy)
     kept = close < max(_CLOSE, _UNLIKE * float(np.sort(close)[len(close) // 4]))
     if not kept.all():
         position, radius = position[kept], radius[kept]
-        sigma = refine(SIGMAS_PX, [_cost(t.rows(chosen[kept])) for t in trials])
+        sigma = likeliest(chosen[kept])
         fits = fit(sigma, KAPPA)
     return _most_likely(film, fits, Optics(sigma, KAPPA / sigma), noise)
 
@@ -226,10 +200,23 @@ def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Floa
     return out
 
 
-def _closeness(fits: BallFits, noise: NoiseModel) -> Float:
-    return misfit(fits, noise) + (1 - fits.explained)
+def _much_more_noise(seeds: BallFits, noise: NoiseModel) -> bool:
+    """Say whether there is much more noise under sure marks than beside them: the noise of specks is soon like any ball then."""
+    sure = seeds.rows(in_correlated_noise(seeds, COARSE_SIGMA_PX, noise) > SURE)
+    more = noise.variance_at(sure.background + sure.depth) / noise.variance_at(sure.background)
+    return bool(len(more) and np.median(more) > _MUCH_MORE)
 
 
-def _cost(fits: BallFits) -> float:
+def _closeness(fits: BallFits, noise: NoiseModel, noisy: bool) -> Float:
+    """What fits leave and do not explain; of specks in much noise that is soon little, but nor is much known of it."""
+    unexplained = (
+        1 - explained_over_noise(fits) + 1 / np.maximum(in_correlated_noise(fits, COARSE_SIGMA_PX, noise), 1.0)
+        if noisy
+        else 1 - fits.explained
+    )
+    return np.asarray(misfit(fits, noise) + unexplained)
+
+
+def _cost(fits: BallFits, say: Float) -> float:
     """Minus twice a log-likelihood: of noise where the model is nearly right, of errors of unknown size where it is far off."""
-    return float(2 * np.log1p(fits.chi2_core).sum())
+    return float(2 * say @ np.log1p(fits.chi2_core))

@@ -20,7 +20,7 @@ from rsa_vision.types import Bool, Float
 
 _NONE = 1e-3  # of the noise: what is not there
 _STEPS = 4  # from where the fit on a quadratic background came to rest
-_AFRESH = (0, 1, 3)  # those with new derivatives
+_AFRESH, _FAR_PX = (0, 1, 3), 0.1  # those with new derivatives, besides those after steps so far
 _MAX_STEP_PX = 0.7
 _FIXED = 1e6  # inverse variance of a radius that is not fitted
 _OUTLIER = 3.0  # standard deviations from which a ball has a size of its own
@@ -99,13 +99,13 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
     target, held = hold(fits, common)
     precision = np.zeros((len(depth), 4 + len(surface)))
     precision[:, 2], precision[:, _PER_BALL:] = held, _precision(known, structure, fits, noise)
-    each = np.arange(precision.shape[1])
+    each, far = np.arange(precision.shape[1]), True
     for step in range(_STEPS):
         shapes = slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, sigma_px)
         value, *by = (shape.astype(np.float64) for shape in shapes)
         ball = depth[:, None] * value
         left = windows.data - ball
-        if step in _AFRESH:
+        if step in _AFRESH or far:
             # a mark takes away its part of what is there: on linear films more where there is more
             shade = 1 + common.proportion.slope * value[:, None]
             curves = surface * shade
@@ -130,6 +130,7 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
         scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(change[:, :3]).max(axis=1), 1e-12))
         local, before = local + scale[:, None] * change[:, :2], radius
         radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
+        far = bool((np.abs(change[:, :3]) > _FAR_PX).any())
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
         residual = left - np.matmul(change[:, None], images)[:, 0]
     estimator = whiten_rows(np.matmul(inverse[:, :2], seen), side, noise) * root

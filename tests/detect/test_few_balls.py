@@ -94,3 +94,27 @@ def test_large_balls_with_much_more_noise_than_beside_them_are_found(radius_px: 
     ratio = float(np.sqrt((error**2 / np.einsum("nii->ni", found.images.covariance_px2[index])).mean()))
     print(f"radius {radius_px}, noise blur {noise_blur_px}: error / sd {ratio:.2f}")
     assert 0.75 < ratio < 1.35
+
+
+@pytest.mark.parametrize(("depth", "thinnest", "sd"), [(0.97, 1.0, 0.25), (0.75, 0.2, 0.14)])
+def test_logarithmic_films_whose_noise_differs_from_mark_to_mark(depth: float, thinnest: float, sd: float) -> None:
+    """Nothing scattered, so that next to nothing comes through balls; and a limb, behind which as little comes through beside them."""
+    square, found_of_all = [], 0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        truth, radius = grid_of_balls(rng, 6, 90.0, (7.8, 8.2))
+        film = film_of_balls((570, 570), truth, radius, depth=depth, sigma_px=2.8) / BACKGROUND
+        film *= thinnest ** np.exp(-(((np.arange(570) - 285) / 140) ** 2))
+        noise = film_of_balls((570, 570), truth[:0], radius[:0], background=0.0, noise_sd=1.0, noise_blur_px=0.6, rng=rng)
+        values = -np.log(np.maximum(film + sd * noise * np.sqrt(film), 0.003))
+        found = detect_markers(stored(2000 + 10000 * (values - values.min())), bits=16)
+        index, gap = nearest(truth, found) if len(found.images) else (np.zeros(36, np.intp), np.full(36, np.inf))
+        assert np.count_nonzero(gap < 3.0) >= len(found.images) - 1
+        images, near = found.images, gap < 3.0
+        found_of_all += np.count_nonzero(near)
+        error = images.position_px[index[near]] - truth[near]
+        square.append((error**2 / np.einsum("nii->ni", images.covariance_px2[index[near]])).ravel())
+    ratio = float(np.sqrt(np.concatenate(square).mean()))
+    print(f"{found_of_all} of 108, error / sd {ratio:.2f}")
+    assert found_of_all >= 92  # a lost one costs less than a wrong one
+    assert 0.8 < ratio < 1.3
