@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.beside import all_but, images_beside
 from rsa_vision.detect.candidates import SCALES, Candidates
+from rsa_vision.detect.crossed import without_scratches
 from rsa_vision.detect.decide import LEAST_KNOWN, look_clear, over_clutter
 from rsa_vision.detect.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, no_fits, plausible, promising
@@ -28,7 +29,8 @@ _CLEAR = 0.9  # of the limit, over clutter
 _FAR, _SLACK = 1.5, 1.4  # times the limit, times the misfit that is tolerated otherwise
 _ROUND = 0.4  # the filter that suits the usual size answers balls of it by round extrema
 _SIZE = 1.6  # ratio of the fitted radius to the usual one
-_OF_SIZE = 1.25  # the same to that of any clear ball, where lines are what is seen first
+_MOST = 0.7  # of what is under it, that a ball explains which a scratch crosses
+_OF_SIZE = 1.25  # the same to that of any clear ball, where lines and scratches are what is seen first
 
 
 def look_again(
@@ -78,12 +80,18 @@ def look_again(
         fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
         place = fits.position_px
     fits = fits.rows(~on_lines(film, join([balls, fits]), limit, optics, noise, needles)[len(balls.depth) :])
+    left = fits.rows(~_like_a_ball(fits, limit, noise))
     fits, edged = beside_edges(film, fits, optics, noise, all_but(balls, np.arange(0), optics, needles))
     like = _like_a_ball(fits, limit, noise)
     fits, edged = fits.rows(like), edged[like]
     known = join([balls, fits])
     over = _over_lines(film, left_over[~_near(left_over, known, usual)], known, usual, limit, optics, noise, needles)
-    return join([fits, over]), np.append(edged, np.ones(len(over.depth), bool))
+    edged = np.append(edged, np.ones(len(over.depth), bool))
+    known = join([known, over])
+    left = left.rows(~_near(left.position_px, known, usual) & (left.explained > _MOST))
+    crossed = without_scratches(film, left, optics, noise, all_but(known, np.arange(0), optics, needles))
+    crossed = crossed.rows(_sure_of_a_size(crossed, known, limit, noise))
+    return join([fits, over, crossed]), np.append(edged, np.zeros(len(crossed.depth), bool))
 
 
 def _over_lines(
@@ -96,15 +104,20 @@ def _over_lines(
     noise: NoiseModel,
     needles: Painted | None,
 ) -> BallFits:
-    """Balls that are seen only beside the line that they lie on: of the sizes that are known, sure, and well described."""
+    """Balls that are seen only beside the line that they lie on."""
     others = all_but(known, np.arange(0), optics, needles)
     fits = balls_on_lines(film, place, usual, limit, optics, noise, others)
     fits = distinct(fits.rows(inside(fits, film) & ~_near(fits.position_px, known, usual) & plausible(fits, noise, NEAR_EDGES)), noise)
     fits, edged = beside_edges(film, fits, optics, noise, others)
+    return fits.rows(edged & _sure_of_a_size(fits, known, limit, noise))
+
+
+def _sure_of_a_size(fits: BallFits, known: BallFits, limit: float, noise: NoiseModel) -> Bool:
+    """Say which are of the sizes of clear balls, sure, and well described."""
     clear = known.radius_px[look_clear(known, noise)]
     size = np.abs(np.log(fits.radius_px[:, None] / clear)).min(axis=1, initial=np.inf) < np.log(_OF_SIZE)
     close = plausible(fits, noise) & (misfit(fits, noise) < DOUBTFUL * MISFIT)
-    return fits.rows(edged & size & close & (over_clutter(fits) > max(SURE, limit)))
+    return np.asarray(size & close & (over_clutter(fits) > max(SURE, limit)))
 
 
 def _like_a_ball(fits: BallFits, limit: float, noise: NoiseModel, slack: float = _SLACK) -> Bool:

@@ -1,0 +1,74 @@
+"""Balls under scratches, dead rows and dust: what most of the window agrees with is a ball, and the rest of it is masked."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.alike import SD_OF_MAD
+from rsa_vision.detect.balls import BallFits, join
+from rsa_vision.detect.beside import Background
+from rsa_vision.detect.find import fit_at, no_fits
+from rsa_vision.detect.foreign import robust_residual
+from rsa_vision.detect.groups import images_in, window_around
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
+from rsa_vision.types import Bool, Float
+
+_FAR: Final = 5.0  # standard deviations that noise does not reach
+_LEAST_SEEN: Final = 0.5  # part of the pixels under a ball
+_ROUNDS: Final = 2  # the first mask is that of a fit which the scratch has pulled
+
+
+def without_scratches(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, others: Background) -> BallFits:
+    """Fit balls again without the pixels that a robust fit leaves over.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    fits : BallFits
+        That explain most of their windows, and leave too much.
+    optics : Optics
+    noise : NoiseModel
+    others : callable
+        Images of all else.
+
+    Returns
+    -------
+    BallFits
+        Those of which at least a half is seen.
+    """
+    parts = [no_fits()]
+    for i in range(len(fits.depth)):
+        ball = fits.rows([i])
+        for _ in range(_ROUNDS):
+            ball = _masked(film, ball, optics, noise, others)
+        parts.append(ball)
+    out = join(parts)
+    return out.rows(out.valid_fraction > _LEAST_SEEN)
+
+
+def _masked(film: NDArray[Any], ball: BallFits, optics: Optics, noise: NoiseModel, others: Background) -> BallFits:
+    window = window_around(film, ball.position_px, ball.radius_px, optics.sigma_px, noise, others)
+    local = ball.position_px - window.corner_px
+    images = images_in(window, window.surface, local, ball.radius_px, optics.sigma_px, optics.mu_px)
+    parts = np.concatenate([images.value, ball.depth[0] * images.slopes[:, 0], window.surface.T])[None]
+    weight = window.valid / noise.variance_at(window.raw)
+    data = window.raw - window.neighbours
+    level = float(np.median(data))
+    residual = robust_residual(parts, (data - level)[None], weight[None], np.zeros(parts.shape[:2]))[0]
+    off = np.abs(residual) * np.sqrt(weight)
+    usual = SD_OF_MAD * float(np.median(off[weight > 0])) if (weight > 0).any() else 1.0
+    found = (off > _FAR * max(1.0, usual)).reshape(window.size, window.size).astype(np.uint8)
+    mask = cv2.dilate(found, np.ones((3, 3), np.uint8)) > 0  # what is left of its flanks pulls as well
+    col, row = np.rint(window.corner_px).astype(np.intp)
+
+    def beside(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+        c, r = np.rint(cols).astype(np.intp) - col, np.rint(rows).astype(np.intp) - row
+        within = (c >= 0) & (r >= 0) & (c < window.size) & (r < window.size)
+        return others(cols, rows), within & mask[r.clip(0, window.size - 1), c.clip(0, window.size - 1)]
+
+    return fit_at(film, ball.position_px, ball.radius_px, optics, noise, beside)
