@@ -24,6 +24,7 @@ from rsa_vision.types import Bool, Float
 
 _FAINT = 0.75  # of the film's usual height: a ball that has all of it is no part of anything, and is taken away beside others
 _FAR = 1.5  # times the significance that a mark must have, for one that lies on a line
+_OF_ENDS = 3.0  # the same, that the end of a line may keep
 
 
 def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
@@ -95,7 +96,9 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
     for i in np.flatnonzero(~full):
         of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], fits.radius_px[[i]], optics, noise, others)
         if of_line > of_ball:
-            out[i] = of_both - of_line < (_FAR * limit) ** 2 or goes_on(film, fits.rows([i]), np.array([i]), beside, optics.sigma_px)[0]
+            own = np.sqrt(max(of_both - of_line, 0.0))
+            end = own < _OF_ENDS * limit and goes_on(film, fits.rows([i]), np.array([i]), beside, optics.sigma_px)[0]
+            out[i] = end or own < _FAR * limit
     return out
 
 
