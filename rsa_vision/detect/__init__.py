@@ -198,12 +198,12 @@ def _one_polarity(
     balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needles)
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching, edged, drawn = balls.rows(keep), touching[keep], edged[keep], drawn[keep]
-    more, at_edge = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needles)
+    more, at_edge, crossed = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needles)
     both = join([balls, more])
     like = are_balls(both, limit, optics.sigma_px, noise)[len(balls.depth) :]
     like &= (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins)
     balls, edged, added = join([balls, more.rows(like)]), np.append(edged, at_edge[like]), np.zeros(np.count_nonzero(like), bool)
-    touching, drawn = np.append(touching, added), np.append(drawn, added)
+    touching, drawn = np.append(touching, added), np.append(drawn, crossed[like])  # the last fit does not know what was masked either
     for fit in doubtful:
         if found := part(film, fit, balls, optics, tee_optics, noise, needles or _nothing, is_tee):
             tee, ball = found

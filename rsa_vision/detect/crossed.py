@@ -19,7 +19,7 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 _FAR: Final = 5.0  # standard deviations that noise does not reach
-_LEAST_SEEN: Final = 0.5  # part of the pixels under a ball
+_LEAST_SEEN: Final = 0.4  # part of the pixels under a ball
 _ROUNDS: Final = 2  # the first mask is that of a fit which the scratch has pulled
 
 
@@ -43,15 +43,17 @@ def without_scratches(film: NDArray[Any], fits: BallFits, optics: Optics, noise:
     """
     parts = [no_fits()]
     for i in range(len(fits.depth)):
-        ball = fits.rows([i])
+        ball: BallFits | None = fits.rows([i])
         for _ in range(_ROUNDS):
-            ball = _masked(film, ball, optics, noise, others)
-        parts.append(ball)
+            ball = ball and _masked(film, ball, optics, noise, others)
+        if ball is not None:
+            parts.append(ball)
     out = join(parts)
     return out.rows(out.valid_fraction > _LEAST_SEEN)
 
 
-def _masked(film: NDArray[Any], ball: BallFits, optics: Optics, noise: NoiseModel, others: Background) -> BallFits:
+def _masked(film: NDArray[Any], ball: BallFits, optics: Optics, noise: NoiseModel, others: Background) -> BallFits | None:
+    """Fit a ball once without what is foreign; none where that is as broad as the ball: bars and letters leave such rests."""
     window = window_around(film, ball.position_px, ball.radius_px, optics.sigma_px, noise, others)
     local = ball.position_px - window.corner_px
     images = images_in(window, window.surface, local, ball.radius_px, optics.sigma_px, optics.mu_px)
@@ -63,6 +65,9 @@ def _masked(film: NDArray[Any], ball: BallFits, optics: Optics, noise: NoiseMode
     off = np.abs(residual) * np.sqrt(weight)
     usual = SD_OF_MAD * float(np.median(off[weight > 0])) if (weight > 0).any() else 1.0
     found = (off > _FAR * max(1.0, usual)).reshape(window.size, window.size).astype(np.uint8)
+    broad = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (int(ball.radius_px[0]) + 1,) * 2)
+    if cv2.erode(found, broad, borderType=cv2.BORDER_CONSTANT, borderValue=0).any():
+        return None
     mask = cv2.dilate(found, np.ones((3, 3), np.uint8)) > 0  # what is left of its flanks pulls as well
     col, row = np.rint(window.corner_px).astype(np.intp)
 

@@ -29,13 +29,13 @@ _CLEAR = 0.9  # of the limit, over clutter
 _FAR, _SLACK = 1.5, 1.4  # times the limit, times the misfit that is tolerated otherwise
 _ROUND = 0.4  # the filter that suits the usual size answers balls of it by round extrema
 _SIZE = 1.6  # ratio of the fitted radius to the usual one
-_MOST = 0.7  # of what is under it, that a ball explains which a scratch crosses
+_UNDER_SCRATCHES = 4.0  # times the misfit that is tolerated otherwise, before they are masked
 _OF_SIZE = 1.25  # the same to that of any clear ball, where lines and scratches are what is seen first
 
 
 def look_again(
     film: NDArray[Any], candidates: Candidates, balls: BallFits, limit: float, optics: Optics, noise: NoiseModel, needles: Painted | None
-) -> tuple[BallFits, Bool]:
+) -> tuple[BallFits, Bool, Bool]:
     """Fit balls of the usual size at the candidates where none was found.
 
     Parameters
@@ -58,10 +58,11 @@ def look_again(
         What may be balls, beside those found so far.
     edged : ndarray of bool, shape (n,)
         Fitted together with an edge.
+    crossed : ndarray of bool, shape (n,)
+        Fitted without the pixels of what crosses them.
     """
-    none = balls.rows(np.zeros(len(balls.depth), bool)), np.zeros(0, bool)
     if len(balls.depth) < LEAST_KNOWN:
-        return none
+        return no_fits(), np.zeros(0, bool), np.zeros(0, bool)
     usual = float(np.median(balls.radius_px))
     scale = SCALES[int(np.argmin([abs(np.log(radius / usual)) for *_, radius in SCALES]))][-1]
     fitting = (candidates.radius_px == scale) & (candidates.roundness > _ROUND)
@@ -77,10 +78,11 @@ def look_again(
         fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick) if len(place) else no_fits()
         stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
         enough = promising(fits, limit, optics.sigma_px, noise) if quick else over_clutter(fits) > _CLEAR * limit
+        if quick:
+            rough = fits.rows(stays & plausible(fits, noise, _UNDER_SCRATCHES) & (fits.significance > max(SURE, limit)))
         fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
         place = fits.position_px
     fits = fits.rows(~on_lines(film, join([balls, fits]), limit, optics, noise, needles)[len(balls.depth) :])
-    left = fits.rows(~_like_a_ball(fits, limit, noise))
     fits, edged = beside_edges(film, fits, optics, noise, all_but(balls, np.arange(0), optics, needles))
     like = _like_a_ball(fits, limit, noise)
     fits, edged = fits.rows(like), edged[like]
@@ -88,10 +90,12 @@ def look_again(
     over = _over_lines(film, left_over[~_near(left_over, known, usual)], known, usual, limit, optics, noise, needles)
     edged = np.append(edged, np.ones(len(over.depth), bool))
     known = join([known, over])
-    left = left.rows(~_near(left.position_px, known, usual) & (left.explained > _MOST))
-    crossed = without_scratches(film, left, optics, noise, all_but(known, np.arange(0), optics, needles))
-    crossed = crossed.rows(_sure_of_a_size(crossed, known, limit, noise))
-    return join([fits, over, crossed]), np.append(edged, np.zeros(len(crossed.depth), bool))
+    rough = distinct(rough.rows(~_near(rough.position_px, known, usual)), noise)
+    crossed = without_scratches(film, rough, optics, noise, all_but(known, np.arange(0), optics, needles))
+    crossed = crossed.rows(~_near(crossed.position_px, known, usual) & _sure_of_a_size(crossed, known, limit, noise))
+    crossed = distinct(crossed, noise)
+    known = join([fits, over, crossed])
+    return known, np.append(edged, np.zeros(len(crossed.depth), bool)), np.arange(len(known.depth)) >= len(edged)
 
 
 def _over_lines(
