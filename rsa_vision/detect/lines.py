@@ -16,7 +16,7 @@ from rsa_vision.detect.decide import LEAST_KNOWN, heights, look_clear
 from rsa_vision.detect.find import no_fits
 from rsa_vision.detect.groups import edge_profile, fit_group, images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.patches import weighted_least_squares
+from rsa_vision.detect.patches import damped_solution
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.whitening import whiten_rows
@@ -135,17 +135,16 @@ def _gains(
     """Return twice the log-likelihood that a ball, a line, and both gain over a background alone, to first order."""
     window = window_around(film, at_px, radius_px, optics.sigma_px, noise, others)
     images = images_in(window, window.surface, at_px - window.corner_px, radius_px, optics.sigma_px, optics.mu_px)
-    ball = np.concatenate([images.value, *images.slopes]).T
-    line = edge_profile(window.raw - window.neighbours, window.valid, optics.sigma_px)
-    root = np.sqrt(window.valid / noise.variance_at(window.raw))
-    basis = np.column_stack([window.surface, ball, line, window.raw - window.neighbours])
-    white = whiten_rows((basis * root[:, None]).T, window.size, noise)
-    data, even = white[-1], np.ones(window.size**2)
-    of = np.repeat([0, 1, 2], [window.surface.shape[1], ball.shape[1], line.shape[1]])
+    data = window.raw - window.neighbours
+    line = edge_profile(data, window.valid, optics.sigma_px)
+    rows = np.concatenate([images.value, *images.slopes, window.surface.T, line.T, data[None]])
+    white = whiten_rows(rows * np.sqrt(window.valid / noise.variance_at(window.raw)), window.size, noise)
+    gram = white @ white.T  # holds the normal equations of all of them
+    before, after = 4 * len(at_px), len(rows) - 1 - line.shape[1]  # the background
 
-    def explained(*which: int) -> float:
-        some = white[:-1][np.isin(of, which)].T
-        return float(data @ some @ weighted_least_squares(some, even, data))
+    def explained(first: int, end: int) -> float:
+        right = gram[first:end, -1]
+        return float(right @ damped_solution(gram[first:end, first:end], right, 1e-9))
 
-    nothing = explained(0)
-    return explained(0, 1) - nothing, explained(0, 2) - nothing, explained(0, 1, 2) - nothing
+    nothing, of_ball, of_line, of_both = (explained(*part) for part in ((before, after), (0, after), (before, -1), (0, -1)))
+    return of_ball - nothing, of_line - nothing, of_both - nothing
