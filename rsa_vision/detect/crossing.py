@@ -148,7 +148,9 @@ def fit_crossing(
         return [scored(replace(f, converged=converged), image, residual, weight, surface, background, variance) for f, image in of_each]
 
     for step in range(steps + 1):
-        blocks = [arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, optics) for f in now]
+        last = step == steps or converged  # nobody asks where to go next
+        offsets = [(cols - f.position_px[0], rows - f.position_px[1]) for f in now]
+        blocks = [arm_images(*at, f.angles, f.shape, optics, slopes=not last) for at, f in zip(offsets, now, strict=True)]
         if optics.proportion:
             blocks = [block * gain_at(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
         tees = np.array([block.sum(1) for block in blocks])  # needles, (image, its derivatives), pixels
@@ -160,7 +162,7 @@ def fit_crossing(
         theta = damped_solution(gram[at, at], gram[at, -1], 1e-6)
         ground = theta[1 - len(surface) :] @ surface[1:]
         now = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta[: len(now)], strict=True)]
-        if step == steps or converged:
+        if last:
             break
         if step == 0 and quick and others is not None and not any(explains(f, PROMISING, 0.0) for f in told()):
             break
