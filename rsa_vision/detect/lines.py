@@ -5,19 +5,20 @@ Faint balls that a line explains better are parts of it. Balls on and beside lin
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits, join
+from rsa_vision.detect.balls import BallFits, half_size, join, slopes
 from rsa_vision.detect.beside import MOST_IN_GROUP, Background, all_but, groups_of, images_beside
 from rsa_vision.detect.decide import LEAST_KNOWN, heights, look_clear
-from rsa_vision.detect.find import no_fits
-from rsa_vision.detect.groups import edge_profile, fit_group, images_in, window_around
+from rsa_vision.detect.find import BATCH, no_fits
+from rsa_vision.detect.groups import edge_profile, fit_group, square
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.patches import damped_solution
-from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.patches import cut, damped_solution
+from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Bool, Float
@@ -93,7 +94,7 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
 
     others = all_but(strong, np.arange(0), optics, tees)
     for i in np.flatnonzero(~full):
-        of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], fits.radius_px[[i]], optics, noise, others)
+        ((of_ball, of_line, of_both),) = _gains(film, fits.position_px[[i]], float(fits.radius_px[i]), optics, noise, others)
         if of_line > of_ball:
             out[i] = of_both - of_line < (_FAR * limit) ** 2 or goes_on(film, fits.rows([i]), np.array([i]), beside, optics.sigma_px)[0]
     return out
@@ -120,31 +121,38 @@ def balls_on_lines(
     BallFits
         With the line in their background, several perhaps of one ball.
     """
-    parts = []
-    for at in place_px:
-        start = at[None], np.array([radius_px])
-        of_ball, of_line, of_both = _gains(film, *start, optics, noise, others)
+    parts, radius = [], np.array([radius_px])
+    gains = [_gains(film, place_px[k : k + BATCH], radius_px, optics, noise, others) for k in range(0, len(place_px), BATCH)]
+    for at, (of_ball, of_line, of_both) in zip(place_px, chain(*gains), strict=True):
         if of_line > of_ball and of_both - of_line > (_FAR * limit) ** 2:
-            parts.append(fit_group(film, *start, optics.sigma_px, optics.mu_px, noise, others, edge=True))
+            parts.append(fit_group(film, at[None], radius, optics.sigma_px, optics.mu_px, noise, others, edge=True))
     return join(parts) if parts else no_fits()
 
 
 def _gains(
-    film: NDArray[Any], at_px: Float, radius_px: Float, optics: Optics, noise: NoiseModel, others: Background
-) -> tuple[float, float, float]:
-    """Return twice the log-likelihood that a ball, a line, and both gain over a background alone, to first order."""
-    window = window_around(film, at_px, radius_px, optics.sigma_px, noise, others)
-    images = images_in(window, window.surface, at_px - window.corner_px, radius_px, optics.sigma_px, optics.mu_px)
-    data = window.raw - window.neighbours
-    line = edge_profile(data, window.valid, optics.sigma_px)
-    rows = np.concatenate([images.value, *images.slopes, window.surface.T, line.T, data[None]])
-    white = whiten_rows(rows * np.sqrt(window.valid / noise.variance_at(window.raw)), window.size, noise)
-    gram = white @ white.T  # holds the normal equations of all of them
-    before, after = 4 * len(at_px), len(rows) - 1 - line.shape[1]  # the background
+    film: NDArray[Any], at_px: Float, radius_px: float, optics: Optics, noise: NoiseModel, others: Background
+) -> list[tuple[float, float, float]]:
+    """Return twice the log-likelihood that a ball, a line, and both gain over a background alone at each place (n, 2), to first order."""
+    half = half_size(radius_px, optics.sigma_px)
+    patches, (cols, rows, surface) = cut(film, at_px, half, noise), square(half)
+    n, local, radius = len(at_px), at_px - patches.corner_px, np.full(len(at_px), radius_px)
+    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
+    balls = np.stack(slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, optics.sigma_px), axis=1)
+    raw, valid = patches.values.reshape(n, -1), patches.valid.reshape(n, -1).astype(np.float64)
+    out = []
+    for ball, data, seen, root, (col, row) in zip(
+        balls, raw, valid, np.sqrt(valid / noise.variance_at(raw)), patches.corner_px.tolist(), strict=True
+    ):
+        data -= others(cols + col, rows + row)
+        line = edge_profile(data, seen, optics.sigma_px)
+        images = np.concatenate([ball, surface.T, line.T, data[None]])
+        white = whiten_rows(images * root, patches.size, noise)
+        gram = white @ white.T  # holds the normal equations of every part of them
+        end = len(ball) + surface.shape[1]
 
-    def explained(first: int, end: int) -> float:
-        right = gram[first:end, -1]
-        return float(right @ damped_solution(gram[first:end, first:end], right, 1e-9))
+        def explained(some: slice, gram: Float = gram) -> float:
+            return float(gram[some, -1] @ damped_solution(gram[some, some], gram[some, -1], 1e-9))
 
-    nothing, of_ball, of_line, of_both = (explained(*part) for part in ((before, after), (0, after), (before, -1), (0, -1)))
-    return of_ball - nothing, of_line - nothing, of_both - nothing
+        nothing = explained(slice(len(ball), end))
+        out.append(tuple(explained(some) - nothing for some in (slice(end), slice(len(ball), -1), slice(-1))))
+    return out
