@@ -315,11 +315,12 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float, *, bent: bool = Fal
         t += turn * along + 0.5 * np.clip(bend, -most, most) * along**2
     step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
     place = (t - t.min()) / step
-    knot = place.astype(np.intp)
+    knot, n = place.astype(np.intp), len(t)
     part = place - knot
     # a spline reaches two knots to either side; those centred off the window are left out
-    splines = np.zeros((int(knot.max()) + 4, len(t)))
+    splines = np.zeros((int(knot.max()) + 4, n))
     of_four = ((1 - part) ** 3 / 6, 2 / 3 - part**2 + part**3 / 2, 2 / 3 - (1 - part) ** 2 + (1 - part) ** 3 / 2, part**3 / 6)
+    first = knot * n + np.arange(n)
     for k, basis in enumerate(of_four):
-        splines[knot + k, np.arange(len(t))] = basis
+        splines.ravel()[first + k * n] = basis
     return splines[1 : int(np.ceil(place.max() - 1e-9)) + 2].T

@@ -5,7 +5,6 @@ Faint balls that a line explains better are parts of it. Balls on and beside lin
 
 from __future__ import annotations
 
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -94,7 +93,7 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
 
     others = all_but(strong, np.arange(0), optics, tees)
     for i in np.flatnonzero(~full):
-        ((of_ball, of_line, of_both),) = _gains(film, fits.position_px[[i]], float(fits.radius_px[i]), optics, noise, others)
+        of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], float(fits.radius_px[i]), optics, noise, others)[0]
         if of_line > of_ball:
             out[i] = of_both - of_line < (_FAR * limit) ** 2 or goes_on(film, fits.rows([i]), np.array([i]), beside, optics.sigma_px)[0]
     return out
@@ -121,38 +120,36 @@ def balls_on_lines(
     BallFits
         With the line in their background, several perhaps of one ball.
     """
-    parts, radius = [], np.array([radius_px])
     gains = [_gains(film, place_px[k : k + BATCH], radius_px, optics, noise, others) for k in range(0, len(place_px), BATCH)]
-    for at, (of_ball, of_line, of_both) in zip(place_px, chain(*gains), strict=True):
-        if of_line > of_ball and of_both - of_line > (_FAR * limit) ** 2:
-            parts.append(fit_group(film, at[None], radius, optics.sigma_px, optics.mu_px, noise, others, edge=True))
-    return join(parts) if parts else no_fits()
+    of_ball, of_line, of_both = np.concatenate([np.zeros((0, 3)), *gains]).T
+    worth = place_px[(of_line > of_ball) & (of_both - of_line > (_FAR * limit) ** 2)]
+    how = (np.array([radius_px]), optics.sigma_px, optics.mu_px, noise, others)
+    return join([no_fits(), *(fit_group(film, at[None], *how, edge=True) for at in worth)])
 
 
-def _gains(
-    film: NDArray[Any], at_px: Float, radius_px: float, optics: Optics, noise: NoiseModel, others: Background
-) -> list[tuple[float, float, float]]:
-    """Return twice the log-likelihood that a ball, a line, and both gain over a background alone at each place (n, 2), to first order."""
+def _gains(film: NDArray[Any], at_px: Float, radius_px: float, optics: Optics, noise: NoiseModel, others: Background) -> Float:
+    """Return twice the log-likelihood that a ball, a line, and both gain over a background alone, to first order.
+
+    For places (n, 2), shape (n, 3).
+    """
     half = half_size(radius_px, optics.sigma_px)
     patches, (cols, rows, surface) = cut(film, at_px, half, noise), square(half)
     n, local, radius = len(at_px), at_px - patches.corner_px, np.full(len(at_px), radius_px)
     table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
     balls = np.stack(slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, optics.sigma_px), axis=1)
     raw, valid = patches.values.reshape(n, -1), patches.valid.reshape(n, -1).astype(np.float64)
-    out = []
-    for ball, data, seen, root, (col, row) in zip(
-        balls, raw, valid, np.sqrt(valid / noise.variance_at(raw)), patches.corner_px.tolist(), strict=True
-    ):
-        data -= others(cols + col, rows + row)
-        line = edge_profile(data, seen, optics.sigma_px)
-        images = np.concatenate([ball, surface.T, line.T, data[None]])
-        white = whiten_rows(images * root, patches.size, noise)
-        gram = white @ white.T  # holds the normal equations of every part of them
-        end = len(ball) + surface.shape[1]
+    root = np.sqrt(valid / noise.variance_at(raw))
+    first, end = balls.shape[1], balls.shape[1] + surface.shape[1]  # the background, between the ball and the line
+    explained = np.zeros((n, 4))
+    for i, (col, row) in enumerate(patches.corner_px.tolist()):
+        data = raw[i] - others(cols + col, rows + row)
+        line = edge_profile(data, valid[i], optics.sigma_px)
+        white = whiten_rows(np.concatenate([balls[i], surface.T, line.T, data[None]]) * root[i], patches.size, noise)
+        gram = white @ white.T  # holds the normal equations of any part of them
+        explained[i] = [_explained(gram, part) for part in (slice(first, end), slice(end), slice(first, -1), slice(-1))]
+    return np.asarray(explained[:, 1:] - explained[:, :1])
 
-        def explained(some: slice, gram: Float = gram) -> float:
-            return float(gram[some, -1] @ damped_solution(gram[some, some], gram[some, -1], 1e-9))
 
-        nothing = explained(slice(len(ball), end))
-        out.append(tuple(explained(some) - nothing for some in (slice(end), slice(len(ball), -1), slice(-1))))
-    return out
+def _explained(gram: Float, part: slice) -> float:
+    """Return how much of the squares of the last row the best combination of a part of the others takes, by the products of all."""
+    return float(gram[part, -1] @ damped_solution(gram[part, part], gram[part, -1], 1e-9))
