@@ -144,8 +144,9 @@ def fit_crossing(
     def told() -> list[NeedleFit]:
         residual, background = data - theta @ linear, float(theta[-len(surface)])
         variance = float(noise.variance_at(np.array([background]))[0])
-        of_each = zip(now, theta[: len(now), None] * tees[:, 0], strict=True)
-        return [scored(replace(f, converged=converged), image, residual, weight, surface, background, variance) for f, image in of_each]
+        fits = [replace(f, depths=np.full(f.angles.shape, depth), converged=converged) for f, depth in zip(now, theta, strict=False)]
+        of_each = zip(fits, theta[: len(now), None] * tees[:, 0], strict=True)
+        return [scored(f, image, residual, weight, surface, background, variance) for f, image in of_each]
 
     for step in range(steps + 1):
         last = step == steps or converged  # nobody asks where to go next
@@ -161,7 +162,6 @@ def fit_crossing(
         at = slice(len(moves), -1)
         theta = damped_solution(gram[at, at], gram[at, -1], 1e-6)
         ground = theta[1 - len(surface) :] @ surface[1:]
-        now = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta[: len(now)], strict=True)]
         if last:
             break
         if step == 0 and quick and others is not None and not any(explains(f, PROMISING, 0.0) for f in told()):
