@@ -144,11 +144,14 @@ def fit_crossing(
     def told() -> list[NeedleFit]:
         residual, background = data - theta @ linear, float(theta[-len(surface)])
         variance = float(noise.variance_at(np.array([background]))[0])
-        of_each = zip(now, theta[: len(now), None] * tees[:, 0], strict=True)
-        return [scored(replace(f, converged=converged), image, residual, weight, surface, background, variance) for f, image in of_each]
+        fits = [replace(f, depths=np.full(f.angles.shape, depth), converged=converged) for f, depth in zip(now, theta, strict=False)]
+        of_each = zip(fits, theta[: len(now), None] * tees[:, 0], strict=True)
+        return [scored(f, image, residual, weight, surface, background, variance) for f, image in of_each]
 
     for step in range(steps + 1):
-        blocks = [arm_images(cols - f.position_px[0], rows - f.position_px[1], f.angles, f.shape, optics) for f in now]
+        last = step == steps or converged  # nobody asks where to go next
+        offsets = [(cols - f.position_px[0], rows - f.position_px[1]) for f in now]
+        blocks = [arm_images(*at, f.angles, f.shape, optics, slopes=not last) for at, f in zip(offsets, now, strict=True)]
         if optics.proportion:
             blocks = [block * gain_at(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
         tees = np.array([block.sum(1) for block in blocks])  # needles, (image, its derivatives), pixels
@@ -159,8 +162,7 @@ def fit_crossing(
         at = slice(len(moves), -1)
         theta = damped_solution(gram[at, at], gram[at, -1], 1e-6)
         ground = theta[1 - len(surface) :] @ surface[1:]
-        now = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta[: len(now)], strict=True)]
-        if step == steps or converged:
+        if last:
             break
         if step == 0 and quick and others is not None and not any(explains(f, PROMISING, 0.0) for f in told()):
             break

@@ -17,7 +17,7 @@ from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
-_BATCH = 48  # windows that stay in the cache
+BATCH = 48  # windows that stay in the cache
 _LIKE = 1.25  # ratio of their sizes
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
 ROUNDNESS = 0.2  # less round extrema are ridges
@@ -67,7 +67,7 @@ def fit_at(
     begin = 0
     while begin < len(order):
         # windows of nearly one size at once; what of them is not a smaller one's is masked
-        index = order[begin : begin + _BATCH]
+        index = order[begin : begin + BATCH]
         index = index[halves[index] <= _LIKE * halves[index[0]]]
         begin += len(index)
         patches = cut(film, position_px[index], int(halves[index[-1]]), noise)

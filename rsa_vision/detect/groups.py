@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -200,11 +201,18 @@ def window_around(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: 
     half = half_size(float(radius_px.max()), sigma_px) + int(np.ceil(float(np.abs(at_px - middle).max())))
     patch = cut(film, middle[None], half, noise)
     corner = patch.corner_px[0].astype(np.float64)
-    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size].reshape(2, -1).astype(np.float64)
+    cols, rows, surface = square(half)
     raw = patch.values[0].ravel()
     neighbours = np.zeros_like(raw) if others is None else others(cols + corner[0], rows + corner[1])
     valid = patch.valid[0].ravel().astype(np.float64)
-    return GroupWindow(patch.size, corner, cols, rows, raw, neighbours, valid, polynomial(half, cols - half, rows - half))
+    return GroupWindow(patch.size, corner, cols, rows, raw, neighbours, valid, surface)
+
+
+@lru_cache(maxsize=64)
+def square(half: int) -> tuple[Float, Float, Float]:
+    """Return the columns and rows (n,) of the pixels of a window of this half side, and a quadratic surface on it (n, 6)."""
+    rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
+    return cols, rows, polynomial(half, cols - half, rows - half)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -307,11 +315,12 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float, *, bent: bool = Fal
         t += turn * along + 0.5 * np.clip(bend, -most, most) * along**2
     step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
     place = (t - t.min()) / step
-    knot = place.astype(np.intp)
+    knot, n = place.astype(np.intp), len(t)
     part = place - knot
     # a spline reaches two knots to either side; those centred off the window are left out
-    splines = np.zeros((int(knot.max()) + 4, len(t)))
+    splines = np.zeros((int(knot.max()) + 4, n))
     of_four = ((1 - part) ** 3 / 6, 2 / 3 - part**2 + part**3 / 2, 2 / 3 - (1 - part) ** 2 + (1 - part) ** 3 / 2, part**3 / 6)
+    first = knot * n + np.arange(n)
     for k, basis in enumerate(of_four):
-        splines[knot + k, np.arange(len(t))] = basis
+        splines.ravel()[first + k * n] = basis
     return splines[1 : int(np.ceil(place.max() - 1e-9)) + 2].T

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits, join
+from rsa_vision.detect.balls import BallFits, half_size, join, slopes
 from rsa_vision.detect.beside import MOST_IN_GROUP, Background, all_but, groups_of, images_beside
 from rsa_vision.detect.decide import LEAST_KNOWN, height_of, look_clear
-from rsa_vision.detect.find import no_fits
-from rsa_vision.detect.groups import edge_profile, fit_group, images_in, window_around
+from rsa_vision.detect.find import BATCH, no_fits
+from rsa_vision.detect.groups import edge_profile, fit_group, square
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.patches import weighted_least_squares
-from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.patches import cut, damped_solution
+from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Bool, Float
@@ -94,7 +94,7 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
 
     others = all_but(strong, np.arange(0), optics, tees)
     for i in np.flatnonzero(~full):
-        of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], fits.radius_px[[i]], optics, noise, others)
+        of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], float(fits.radius_px[i]), optics, noise, others)[0]
         if of_line > of_ball:
             own = np.sqrt(max(of_both - of_line, 0.0))
             end = own < _OF_ENDS * limit and goes_on(film, fits.rows([i]), np.array([i]), beside, optics.sigma_px)[0]
@@ -123,32 +123,36 @@ def balls_on_lines(
     BallFits
         With the line in their background, several perhaps of one ball.
     """
-    parts = []
-    for at in place_px:
-        start = at[None], np.array([radius_px])
-        of_ball, of_line, of_both = _gains(film, *start, optics, noise, others)
-        if of_line > of_ball and of_both - of_line > (_FAR * limit) ** 2:
-            parts.append(fit_group(film, *start, optics.sigma_px, optics.mu_px, noise, others, edge=True))
-    return join(parts) if parts else no_fits()
+    gains = [_gains(film, place_px[k : k + BATCH], radius_px, optics, noise, others) for k in range(0, len(place_px), BATCH)]
+    of_ball, of_line, of_both = np.concatenate([np.zeros((0, 3)), *gains]).T
+    worth = place_px[(of_line > of_ball) & (of_both - of_line > (_FAR * limit) ** 2)]
+    how = (np.array([radius_px]), optics.sigma_px, optics.mu_px, noise, others)
+    return join([no_fits(), *(fit_group(film, at[None], *how, edge=True) for at in worth)])
 
 
-def _gains(
-    film: NDArray[Any], at_px: Float, radius_px: Float, optics: Optics, noise: NoiseModel, others: Background
-) -> tuple[float, float, float]:
-    """Return twice the log-likelihood that a ball, a line, and both gain over a background alone, to first order."""
-    window = window_around(film, at_px, radius_px, optics.sigma_px, noise, others)
-    images = images_in(window, window.surface, at_px - window.corner_px, radius_px, optics.sigma_px, optics.mu_px)
-    ball = np.concatenate([images.value, *images.slopes]).T
-    line = edge_profile(window.raw - window.neighbours, window.valid, optics.sigma_px)
-    root = np.sqrt(window.valid / noise.variance_at(window.raw))
-    basis = np.column_stack([window.surface, ball, line, window.raw - window.neighbours])
-    white = whiten_rows((basis * root[:, None]).T, window.size, noise)
-    data, even = white[-1], np.ones(window.size**2)
-    of = np.repeat([0, 1, 2], [window.surface.shape[1], ball.shape[1], line.shape[1]])
+def _gains(film: NDArray[Any], at_px: Float, radius_px: float, optics: Optics, noise: NoiseModel, others: Background) -> Float:
+    """Return twice the log-likelihood that a ball, a line, and both gain over a background alone, to first order.
 
-    def explained(*which: int) -> float:
-        some = white[:-1][np.isin(of, which)].T
-        return float(data @ some @ weighted_least_squares(some, even, data))
+    For places (n, 2), shape (n, 3).
+    """
+    half = half_size(radius_px, optics.sigma_px)
+    patches, (cols, rows, surface) = cut(film, at_px, half, noise), square(half)
+    n, local, radius = len(at_px), at_px - patches.corner_px, np.full(len(at_px), radius_px)
+    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
+    balls = np.stack(slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, optics.sigma_px), axis=1)
+    raw, valid = patches.values.reshape(n, -1), patches.valid.reshape(n, -1).astype(np.float64)
+    root = np.sqrt(valid / noise.variance_at(raw))
+    first, end = balls.shape[1], balls.shape[1] + surface.shape[1]  # the background, between the ball and the line
+    explained = np.zeros((n, 4))
+    for i, (col, row) in enumerate(patches.corner_px.tolist()):
+        data = raw[i] - others(cols + col, rows + row)
+        line = edge_profile(data, valid[i], optics.sigma_px)
+        white = whiten_rows(np.concatenate([balls[i], surface.T, line.T, data[None]]) * root[i], patches.size, noise)
+        gram = white @ white.T  # holds the normal equations of any part of them
+        explained[i] = [_explained(gram, part) for part in (slice(first, end), slice(end), slice(first, -1), slice(-1))]
+    return np.asarray(explained[:, 1:] - explained[:, :1])
 
-    nothing = explained(0)
-    return explained(0, 1) - nothing, explained(0, 2) - nothing, explained(0, 1, 2) - nothing
+
+def _explained(gram: Float, part: slice) -> float:
+    """Return how much of the squares of the last row the best combination of a part of the others takes, by the products of all."""
+    return float(gram[part, -1] @ damped_solution(gram[part, part], gram[part, -1], 1e-9))

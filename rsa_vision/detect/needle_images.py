@@ -221,13 +221,18 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
     return image
 
 
-def arm_images(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None) -> Float:
+def arm_images(
+    dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None, *, slopes: bool = True
+) -> Float:
     """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the second axis.
 
-    With slants, those by the slant and by the skew of each arm follow.
+    With slants, those by the slant and by the skew of each arm follow; without slopes, the opacity is all.
     """
     seen = _Seen.of(dx, dy, angles, shape, optics)
-    value, (more_w, more_l, *more, g_s, g_p) = seen.values(shape, slants, slopes=True)
+    value, more = seen.values(shape, slants, slopes=slopes)
+    if not slopes:
+        return seen.spread([value])
+    more_w, more_l, *more, g_s, g_p = more
     along, across = (seen.at_s + seen.first[0] / CELL) * seen.cell_s, (seen.at_p + seen.first[1] / CELL) * seen.cell_p
     c, s = np.cos(angles)[seen.arm], -np.sin(angles)[seen.arm]
     g_s, g_p = g_s * (CELL / seen.cell_s), g_p * (CELL / seen.cell_p)

@@ -18,6 +18,7 @@ from rsa_vision.types import Bool, Float
 _STEPS = 14
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
 _CLOSE_PX = 0.1
+_MOVES = 5  # tip, half width, length, direction
 PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
 STANDS_OUT = 15.0  # significance from which noise may hide the form: what is chosen of a film's places stands out less
 
@@ -71,12 +72,13 @@ def fit_needles(
     converged = False
     steps, close, far = (6, _CLOSE_PX, 3.0) if quick else (_STEPS, _CONVERGED_PX, 1.5)
     for step in range(steps + 1):
-        image, *moves = arm_images(cols - tip[0], rows - tip[1], angles, shape, optics).sum(1)
-        linear = np.concatenate([image[None], surface])
+        last = step == steps or converged  # nobody asks where to go next
+        images = arm_images(cols - tip[0], rows - tip[1], angles, shape, optics, slopes=not last).sum(1)
+        moves, linear = images[1:], np.concatenate([images[:1], surface])
         weighted = np.concatenate([moves, linear, data[None]]) * np.sqrt(weight)
         gram = weighted @ weighted.T
         theta = damped_solution(gram[len(moves) : -1, len(moves) : -1], gram[len(moves) : -1, -1], 1e-9)
-        if step == steps or converged:
+        if last:
             break
         delta = step_of(gram, theta, len(moves), 1e-4 if step < 4 else 1e-7)
         if step in (0, 3):
@@ -90,13 +92,13 @@ def fit_needles(
         converged = step > 0 and bool(np.abs(delta[:2]).max() < close)
         if np.hypot(*(tip - tip_px)) > 0.6 * half:
             return _unfit(tip, angles, shape)
-    image, residual = theta[0] * image, data - theta @ linear
+    image, residual = theta[0] * linear[0], data - theta @ linear
     ring = ~under(image)
     background = float(theta[1])
     fit = replace(
         _unfit(tip, angles, shape),
         depths=np.full(len(angles), theta[0]),
-        chi2_ring=float((weight * residual**2)[ring].sum() / max(int(ring.sum()) - len(gram) + 1, 1)),
+        chi2_ring=float((weight * residual**2)[ring].sum() / max(int(ring.sum()) - _MOVES - len(linear), 1)),
         converged=converged,
     )
     variance = float(noise.variance_at(np.array([background]))[0])
