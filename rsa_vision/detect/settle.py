@@ -42,6 +42,7 @@ _ROUNDED = 1.0  # variance of noise up to which areas have one value
 _QUARTILE, _OF_CHANCE = 0.75, 2.773  # the upper one, of chi2 with two degrees of freedom: errors by bone have longer tails than it
 _BATCH = 20
 _USUAL = 6.0  # of chi2 with two degrees of freedom: 95 of 100 are less
+_AGREE = 3.0  # less than 1 / OF_SHIFT: by that part of the square in its variance every way back to the fit without the edge would be near
 _LEAST_CHANCE = 0.2  # of the variance by weights alone
 
 
@@ -116,7 +117,7 @@ def settle(
             fits.covariance[:, :2, :2] += both
             # there is an edge, which surfaces do not know: they are believed if they agree with it, or leave less
             chance = np.einsum("ni,ni->n", apart, np.linalg.solve(balls.covariance[part, :2, :2], apart[:, :, None])[:, :, 0])
-            stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _USUAL) & (better < CHANCE))
+            stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _AGREE) & (better < CHANCE))
             moved = free[part] & ~(edged[part] & stays)
             out = _put(out, part, fits, moved)
             stay = free[part] & crossed & ~moved
