@@ -17,7 +17,19 @@ from rsa_vision.detect.candidates import SCALES, Candidates
 from rsa_vision.detect.crossed import without_scratches
 from rsa_vision.detect.decide import LEAST_KNOWN, look_clear, over_clutter
 from rsa_vision.detect.edges import NEAR_EDGES, beside_edges
-from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, no_fits, plausible, promising
+from rsa_vision.detect.find import (
+    DOUBTFUL,
+    MISFIT,
+    STRENGTH,
+    SURE,
+    distinct,
+    fit_at,
+    in_correlated_noise,
+    misfit,
+    no_fits,
+    plausible,
+    promising,
+)
 from rsa_vision.detect.lines import balls_on_lines, on_lines
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import Painted
@@ -65,21 +77,23 @@ def look_again(
         return no_fits(), np.zeros(0, bool), np.zeros(0, bool)
     usual = float(np.median(balls.radius_px))
     scale = SCALES[int(np.argmin([abs(np.log(radius / usual)) for *_, radius in SCALES]))][-1]
-    fitting = (candidates.radius_px == scale) & (candidates.roundness > _ROUND)
-    place = candidates.position_px[fitting & ~_near(candidates.position_px, balls, usual)]
+    fitting = (candidates.radius_px == scale) & (candidates.roundness > _ROUND) & ~_near(candidates.position_px, balls, usual)
+    place, strong = candidates.position_px[fitting], np.abs(candidates.strength[fitting]) > STRENGTH
     if needles is not None:
-        place = place[~needles.explain(film, place, np.full(len(place), usual))]
+        free = ~needles.explain(film, place, np.full(len(place), usual))
+        place, strong = place[free], strong[free]
 
     def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
         return images_beside(balls, np.arange(0), optics, needles, cols, rows)
 
-    left_over = place
+    left_over = place[strong]  # a line takes the most part of what is there, and the rest has to be sure
     for quick in (True, False):
         fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick) if len(place) else no_fits()
         stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
         enough = promising(fits, limit, optics.sigma_px, noise) if quick else over_clutter(fits) > _CLEAR * limit
         if quick:
-            rough = fits.rows(stays & plausible(fits, noise, _UNDER_SCRATCHES) & (fits.significance > max(SURE, limit)))
+            sure = in_correlated_noise(fits, optics.sigma_px, noise) > max(SURE, limit)
+            rough = fits.rows(stays & sure & plausible(fits, noise, _UNDER_SCRATCHES) & ~plausible(fits, noise))
         fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
         place = fits.position_px
     fits = fits.rows(~on_lines(film, join([balls, fits]), limit, optics, noise, needles)[len(balls.depth) :])
