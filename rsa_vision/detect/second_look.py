@@ -1,7 +1,7 @@
 """Balls that a first look missed: where the film's balls are known, one like them is looked for at every candidate left over.
 
 A first look starts from the size that the filter suits and from guessed optics. Beside an edge, or faint on bone, it grows until it holds
-the bone as well; started from the usual size it stays with the ball.
+the bone as well; started from the usual size it stays with the ball. Then balls on lines as strong as they are, and under scratches.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _CLEAR = 0.9  # of the limit, over clutter
 _FAR, _SLACK = 1.5, 1.4  # times the limit, times the misfit that is tolerated otherwise
 _ROUND = 0.4  # the filter that suits the usual size answers balls of it by round extrema
 _SIZE = 1.6  # ratio of the fitted radius to the usual one
-_UNDER_SCRATCHES = 4.0  # times the misfit that is tolerated otherwise, before they are masked
+_ROUGH = 4.0  # times the misfit that is tolerated otherwise, before they are masked
 _OF_SIZE = 1.25  # the same to that of any clear ball, where lines and scratches are what is seen first
 
 
@@ -82,34 +82,66 @@ def look_again(
     if needles is not None:
         free = ~needles.explain(film, place, np.full(len(place), usual))
         place, strong = place[free], strong[free]
+    fits, edged, rough = _of_the_usual_size(film, place, balls, usual, limit, optics, noise, needles)
+    known = join([balls, fits])
+    # a line takes the most part of what is there, and the rest has to be sure: faint places are not worth it
+    left_over = place[strong]
+    over = _over_lines(film, left_over[~_near(left_over, known, usual)], known, usual, limit, optics, noise, needles)
+    known = join([known, over])
+    crossed = _under_scratches(film, rough, known, usual, limit, optics, noise, needles)
+    count = [len(fits.depth), len(over.depth), len(crossed.depth)]
+    at_edges = np.concatenate([edged, np.repeat([True, False], count[1:])])
+    return join([fits, over, crossed]), at_edges, np.repeat([False, False, True], count)
+
+
+def _of_the_usual_size(
+    film: NDArray[Any],
+    place: Float,
+    balls: BallFits,
+    usual: float,
+    limit: float,
+    optics: Optics,
+    noise: NoiseModel,
+    needles: Painted | None,
+) -> tuple[BallFits, Bool, BallFits]:
+    """Balls at these places, those of them with an edge, and what is sure but leaves too much for a ball."""
 
     def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
         return images_beside(balls, np.arange(0), optics, needles, cols, rows)
 
-    left_over = place[strong]  # a line takes the most part of what is there, and the rest has to be sure
-    for quick in (True, False):
-        fits = fit_at(film, place, np.full(len(place), usual), optics, noise, others, quick=quick) if len(place) else no_fits()
+    def fit(at: Float, *, quick: bool) -> tuple[BallFits, Bool]:
+        fits = fit_at(film, at, np.full(len(at), usual), optics, noise, others, quick=quick) if len(at) else no_fits()
         stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
-        enough = promising(fits, limit, optics.sigma_px, noise) if quick else over_clutter(fits) > _CLEAR * limit
-        if quick:
-            sure = in_correlated_noise(fits, optics.sigma_px, noise) > max(SURE, limit)
-            rough = fits.rows(stays & sure & plausible(fits, noise, _UNDER_SCRATCHES) & ~plausible(fits, noise))
-        fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
-        place = fits.position_px
+        return fits, stays
+
+    fits, stays = fit(place, quick=True)
+    sure = in_correlated_noise(fits, optics.sigma_px, noise) > max(SURE, limit)
+    rough = fits.rows(stays & sure & plausible(fits, noise, _ROUGH) & ~plausible(fits, noise))
+    enough = promising(fits, limit, optics.sigma_px, noise)
+    fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
+    fits, stays = fit(fits.position_px, quick=False)
+    enough = over_clutter(fits) > _CLEAR * limit
+    fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
     fits = fits.rows(~on_lines(film, join([balls, fits]), limit, optics, noise, needles)[len(balls.depth) :])
     fits, edged = beside_edges(film, fits, optics, noise, all_but(balls, np.arange(0), optics, needles))
     like = _like_a_ball(fits, limit, noise)
-    fits, edged = fits.rows(like), edged[like]
-    known = join([balls, fits])
-    over = _over_lines(film, left_over[~_near(left_over, known, usual)], known, usual, limit, optics, noise, needles)
-    edged = np.append(edged, np.ones(len(over.depth), bool))
-    known = join([known, over])
+    return fits.rows(like), edged[like], rough
+
+
+def _under_scratches(
+    film: NDArray[Any],
+    rough: BallFits,
+    known: BallFits,
+    usual: float,
+    limit: float,
+    optics: Optics,
+    noise: NoiseModel,
+    needles: Painted | None,
+) -> BallFits:
+    """Balls that are described well once what crosses them is masked."""
     rough = distinct(rough.rows(~_near(rough.position_px, known, usual)), noise)
-    crossed = without_scratches(film, rough, optics, noise, all_but(known, np.arange(0), optics, needles))
-    crossed = crossed.rows(~_near(crossed.position_px, known, usual) & _sure_of_a_size(crossed, known, limit, noise))
-    crossed = distinct(crossed, noise)
-    known = join([fits, over, crossed])
-    return known, np.append(edged, np.zeros(len(crossed.depth), bool)), np.arange(len(known.depth)) >= len(edged)
+    fits = without_scratches(film, rough, optics, noise, all_but(known, np.arange(0), optics, needles))
+    return distinct(fits.rows(~_near(fits.position_px, known, usual) & _sure_of_a_size(fits, known, limit, noise)), noise)
 
 
 def _over_lines(
