@@ -8,17 +8,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.alike import SD_OF_MAD
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.beside import Background
 from rsa_vision.detect.find import fit_at, no_fits
-from rsa_vision.detect.foreign import robust_residual
+from rsa_vision.detect.foreign import beyond_noise, robust_residual
 from rsa_vision.detect.groups import images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
-_FAR: Final = 5.0  # standard deviations that noise does not reach
 _LEAST_SEEN: Final = 0.4  # part of the pixels under a ball
 _ROUNDS: Final = 2  # the first mask is that of a fit which the scratch has pulled
 
@@ -39,7 +37,7 @@ def without_scratches(film: NDArray[Any], fits: BallFits, optics: Optics, noise:
     Returns
     -------
     BallFits
-        Those of which at least a half is seen.
+        Those of which two fifths are seen at least.
     """
     parts = [no_fits()]
     for i in range(len(fits.depth)):
@@ -60,11 +58,9 @@ def _masked(film: NDArray[Any], ball: BallFits, optics: Optics, noise: NoiseMode
     parts = np.concatenate([images.value, ball.depth[0] * images.slopes[:, 0], window.surface.T])[None]
     weight = window.valid / noise.variance_at(window.raw)
     data = window.raw - window.neighbours
-    level = float(np.median(data))
-    residual = robust_residual(parts, (data - level)[None], weight[None], np.zeros(parts.shape[:2]))[0]
-    off = np.abs(residual) * np.sqrt(weight)
-    usual = SD_OF_MAD * float(np.median(off[weight > 0])) if (weight > 0).any() else 1.0
-    found = (off > _FAR * max(1.0, usual)).reshape(window.size, window.size).astype(np.uint8)
+    residual = robust_residual(parts, data[None], weight[None], np.zeros(parts.shape[:2]))
+    off = beyond_noise(np.abs(residual) * np.sqrt(weight), weight[None] > 0)
+    found = off.reshape(window.size, window.size).astype(np.uint8)
     broad = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (int(ball.radius_px[0]) + 1,) * 2)
     if cv2.erode(found, broad, borderType=cv2.BORDER_CONSTANT, borderValue=0).any():
         return None

@@ -53,10 +53,19 @@ def foreign(residual: Float, weight: Float, where: Bool, gain: float) -> Bool:
     smooth = mean * _SMOOTH / np.sqrt(np.maximum(share, 1 / _SMOOTH**2) * gain)
     found = np.zeros(where.shape, bool)
     for off in (np.abs(normed), np.abs(smooth)):
-        usual = np.array([np.median(row[here]) if here.any() else 0.0 for row, here in zip(off, where & (weight > 0), strict=True)])
-        found |= where & (off > _FAR * np.maximum(1.0, SD_OF_MAD * usual)[:, None])
+        found |= where & beyond_noise(off, where & (weight > 0))
     little = found.sum(axis=1) < _MOST_FOREIGN * where.sum(axis=1)
     return np.asarray(found & little[:, None])
+
+
+def beyond_noise(off: Float, seen: Bool) -> Bool:
+    """Say what is five standard deviations off; these are one, or more where the usual pixel that is seen is farther off, (n, pixels)."""
+    return np.asarray(off > _FAR * _scale(off, seen))
+
+
+def _scale(off: Float, seen: Bool) -> Float:
+    usual = np.array([np.median(row[here]) if here.any() else 0.0 for row, here in zip(off, seen, strict=True)])
+    return np.asarray(np.maximum(1.0, SD_OF_MAD * usual)[:, None])
 
 
 def robust_residual(images: Float, data: Float, weight: Float, precision: Float) -> Float:
@@ -83,8 +92,7 @@ def robust_residual(images: Float, data: Float, weight: Float, precision: Float)
         change = np.matmul(invert(normal), np.matmul(weighted, data[:, :, None]))[:, :, 0]
         residual = data - np.matmul(change[:, None], images)[:, 0]
         off = np.abs(residual) * np.sqrt(weight)
-        usual = np.array([np.median(row[seen]) if seen.any() else 0.0 for row, seen in zip(off, weight > 0, strict=True)])
-        least = _AT_EASE * np.maximum(1.0, SD_OF_MAD * usual)[:, None]
+        least = _AT_EASE * _scale(off, weight > 0)
         scale = np.maximum(np.where(np.isfinite(scale), scale / _FALL, off.max(axis=1, keepdims=True)), least)
         trust = weight / (1 + (off / scale) ** 2) ** 2
     return residual

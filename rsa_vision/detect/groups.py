@@ -212,7 +212,10 @@ def window_around(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: 
 def square(half: int) -> tuple[Float, Float, Float]:
     """Return the columns and rows (n,) of the pixels of a window of this half side, and a quadratic surface on it (n, 6)."""
     rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
-    return cols, rows, polynomial(half, cols - half, rows - half)
+    surface = polynomial(half, cols - half, rows - half)
+    for shared in (cols, rows, surface):
+        shared.setflags(write=False)
+    return cols, rows, surface
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -81,10 +81,6 @@ class NoiseModel:
         shared = np.exp(-(lag[:, None] ** 2 + lag**2) / (4 * np.square(spread_px)[..., None, None]))  # autocorrelation of the Gaussian
         return np.asarray((shared * self.correlation).sum((-2, -1)))
 
-    def as_white(self) -> NoiseModel:
-        """Return the same noise as if that of neighbouring pixels were independent."""
-        return replace(self, correlation=_lag_zero())
-
     @property
     def is_white(self) -> bool:
         """Noise of neighbouring pixels is independent."""

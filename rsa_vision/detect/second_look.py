@@ -6,13 +6,14 @@ the bone as well; started from the usual size it stays with the ball. Then balls
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits, join
-from rsa_vision.detect.beside import all_but, images_beside
+from rsa_vision.detect.beside import Background, all_but, images_beside
 from rsa_vision.detect.candidates import SCALES, Candidates
 from rsa_vision.detect.crossed import without_scratches
 from rsa_vision.detect.decide import LEAST_KNOWN, look_clear, over_clutter
@@ -82,37 +83,54 @@ def look_again(
     if needles is not None:
         free = ~needles.explain(film, place, np.full(len(place), usual))
         place, strong = place[free], strong[free]
-    fits, edged, rough = _of_the_usual_size(film, place, balls, usual, limit, optics, noise, needles)
+    look = _Look(film, usual, limit, optics, noise, needles)
+    fits, edged, rough = _of_the_usual_size(look, place, balls)
     known = join([balls, fits])
     # a line takes the most part of what is there, and the rest has to be sure: faint places are not worth it
-    left_over = place[strong]
-    over = _over_lines(film, left_over[~_near(left_over, known, usual)], known, usual, limit, optics, noise, needles)
-    known = join([known, over])
-    crossed = _under_scratches(film, rough, known, usual, limit, optics, noise, needles)
+    over = _over_lines(look, place[strong], known)
+    crossed = _under_scratches(look, rough, join([known, over]))
     count = [len(fits.depth), len(over.depth), len(crossed.depth)]
     at_edges = np.concatenate([edged, np.repeat([True, False], count[1:])])
     return join([fits, over, crossed]), at_edges, np.repeat([False, False, True], count)
 
 
-def _of_the_usual_size(
-    film: NDArray[Any],
-    place: Float,
-    balls: BallFits,
-    usual: float,
-    limit: float,
-    optics: Optics,
-    noise: NoiseModel,
-    needles: Painted | None,
-) -> tuple[BallFits, Bool, BallFits]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """What all three kinds of balls are looked for with, as of :func:`look_again`; ``usual`` is the radius of the film's balls."""
+
+    film: NDArray[Any]
+    usual: float
+    limit: float
+    optics: Optics
+    noise: NoiseModel
+    needles: Painted | None
+
+    def beside(self, known: BallFits) -> Background:
+        """Images of needles and of all these balls."""
+        return all_but(known, np.arange(0), self.optics, self.needles)
+
+    def may_be(self, fits: BallFits, known: BallFits) -> Bool:
+        """Say which lie on the film and on no known ball."""
+        return inside(fits, self.film) & ~_near(fits.position_px, known, self.usual)
+
+    def sure(self, fits: BallFits, known: BallFits) -> Bool:
+        """Say which are of the sizes of clear balls, sure, and well described."""
+        clear = known.radius_px[look_clear(known, self.noise)]
+        size = np.abs(np.log(fits.radius_px[:, None] / clear)).min(axis=1, initial=np.inf) < np.log(_OF_SIZE)
+        close = plausible(fits, self.noise) & (misfit(fits, self.noise) < DOUBTFUL * MISFIT)
+        return np.asarray(size & close & (over_clutter(fits) > max(SURE, self.limit)))
+
+
+def _of_the_usual_size(look: _Look, place: Float, balls: BallFits) -> tuple[BallFits, Bool, BallFits]:
     """Balls at these places, those of them with an edge, and what is sure but leaves too much for a ball."""
+    film, usual, limit, optics, noise, needles = look.film, look.usual, look.limit, look.optics, look.noise, look.needles
 
     def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
         return images_beside(balls, np.arange(0), optics, needles, cols, rows)
 
     def fit(at: Float, *, quick: bool) -> tuple[BallFits, Bool]:
         fits = fit_at(film, at, np.full(len(at), usual), optics, noise, others, quick=quick) if len(at) else no_fits()
-        stays = inside(fits, film) & ~_near(fits.position_px, balls, usual) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
-        return fits, stays
+        return fits, look.may_be(fits, balls) & (np.abs(np.log(fits.radius_px / usual)) < np.log(_SIZE))
 
     fits, stays = fit(place, quick=True)
     sure = in_correlated_noise(fits, optics.sigma_px, noise) > max(SURE, limit)
@@ -123,51 +141,25 @@ def _of_the_usual_size(
     enough = over_clutter(fits) > _CLEAR * limit
     fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
     fits = fits.rows(~on_lines(film, join([balls, fits]), limit, optics, noise, needles)[len(balls.depth) :])
-    fits, edged = beside_edges(film, fits, optics, noise, all_but(balls, np.arange(0), optics, needles))
+    fits, edged = beside_edges(film, fits, optics, noise, look.beside(balls))
     like = _like_a_ball(fits, limit, noise)
     return fits.rows(like), edged[like], rough
 
 
-def _under_scratches(
-    film: NDArray[Any],
-    rough: BallFits,
-    known: BallFits,
-    usual: float,
-    limit: float,
-    optics: Optics,
-    noise: NoiseModel,
-    needles: Painted | None,
-) -> BallFits:
-    """Balls that are described well once what crosses them is masked."""
-    rough = distinct(rough.rows(~_near(rough.position_px, known, usual)), noise)
-    fits = without_scratches(film, rough, optics, noise, all_but(known, np.arange(0), optics, needles))
-    return distinct(fits.rows(~_near(fits.position_px, known, usual) & _sure_of_a_size(fits, known, limit, noise)), noise)
-
-
-def _over_lines(
-    film: NDArray[Any],
-    place: Float,
-    known: BallFits,
-    usual: float,
-    limit: float,
-    optics: Optics,
-    noise: NoiseModel,
-    needles: Painted | None,
-) -> BallFits:
+def _over_lines(look: _Look, place: Float, known: BallFits) -> BallFits:
     """Balls that are seen only beside the line that they lie on."""
-    others = all_but(known, np.arange(0), optics, needles)
-    fits = balls_on_lines(film, place, usual, limit, optics, noise, others)
-    fits = distinct(fits.rows(inside(fits, film) & ~_near(fits.position_px, known, usual) & plausible(fits, noise, NEAR_EDGES)), noise)
-    fits, edged = beside_edges(film, fits, optics, noise, others)
-    return fits.rows(edged & _sure_of_a_size(fits, known, limit, noise))
+    others, place = look.beside(known), place[~_near(place, known, look.usual)]
+    fits = balls_on_lines(look.film, place, look.usual, look.limit, look.optics, look.noise, others)
+    fits = distinct(fits.rows(look.may_be(fits, known) & plausible(fits, look.noise, NEAR_EDGES)), look.noise)
+    fits, edged = beside_edges(look.film, fits, look.optics, look.noise, others)
+    return fits.rows(edged & look.sure(fits, known))
 
 
-def _sure_of_a_size(fits: BallFits, known: BallFits, limit: float, noise: NoiseModel) -> Bool:
-    """Say which are of the sizes of clear balls, sure, and well described."""
-    clear = known.radius_px[look_clear(known, noise)]
-    size = np.abs(np.log(fits.radius_px[:, None] / clear)).min(axis=1, initial=np.inf) < np.log(_OF_SIZE)
-    close = plausible(fits, noise) & (misfit(fits, noise) < DOUBTFUL * MISFIT)
-    return np.asarray(size & close & (over_clutter(fits) > max(SURE, limit)))
+def _under_scratches(look: _Look, rough: BallFits, known: BallFits) -> BallFits:
+    """Balls that are described well once what crosses them is masked."""
+    rough = distinct(rough.rows(~_near(rough.position_px, known, look.usual)), look.noise)
+    fits = without_scratches(look.film, rough, look.optics, look.noise, look.beside(known))
+    return distinct(fits.rows(look.may_be(fits, known) & look.sure(fits, known)), look.noise)
 
 
 def _like_a_ball(fits: BallFits, limit: float, noise: NoiseModel, slack: float = _SLACK) -> Bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -36,7 +38,7 @@ def dead_pixels(at: Float, rng: np.random.Generator) -> Float:
 
 
 @pytest.mark.parametrize("fault", [scratch, dead_pixels], ids=["scratches", "dead pixels"])
-def test_balls_under_faults_are_found_and_their_errors_stated(fault) -> None:  # type: ignore[no-untyped-def]
+def test_balls_under_faults_are_found_and_their_errors_stated(fault: Callable[[Float, np.random.Generator], Float]) -> None:
     found, ratios = 0, []
     count = 0
     for seed in range(FILMS):
