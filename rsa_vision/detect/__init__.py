@@ -38,6 +38,7 @@ from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import doubt_of_number, resolve_balls
+from rsa_vision.detect.response import BITS, in_film_values, is_straighter, logarithms, scale_matters
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
@@ -74,6 +75,7 @@ class Detection:
     optics : Optics
         Blur (with the pixel's own) and attenuation.
     noise : NoiseModel
+        In the scale in which the film was measured.
     """
 
     images: MarkerImages
@@ -101,16 +103,24 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     -------
     Detection
     """
-    noise = estimate_noise(values, bits)
     limit = significance_limit(values.size, 2.5, false_detections)
+    return _detect(values, bits, estimate_noise(values, bits), limit)
+
+
+def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *, as_it_is: bool = False) -> Detection:
+    """``as_it_is``: in no other scale of the values."""
     faint = find_candidates(values, STRENGTH, noise)
     candidates = faint.rows(np.abs(faint.strength) > STRENGTH)
     pins = look_for_pins(values, candidates.strokes, noise)
     seeds, signs = _seeds(values, candidates, pins, noise)
-    found = [
-        _one_polarity(values, bits, sign, optics, mine, pins, candidates, faint, of_marks, limit)
-        for sign, optics, mine, of_marks in _polarities(values, signs, seeds, pins, candidates, noise)
-    ]
+    found = []
+    for sign, optics, mine, of_marks in _polarities(values, signs, seeds, pins, candidates, noise):
+        if sign > 0 and not as_it_is and scale_matters(mine, of_marks):
+            other, its_noise = logarithms(values, bits, noise)
+            if is_straighter(values, noise, other, its_noise, mine, optics):
+                detection = _detect(other, BITS, its_noise, limit, as_it_is=True)
+                return replace(detection, images=in_film_values(detection.images, bits))
+        found.append(_one_polarity(values, bits, sign, optics, mine, pins, candidates, faint, of_marks, limit))
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
 

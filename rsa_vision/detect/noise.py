@@ -25,7 +25,7 @@ _ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many
 _TAIL = 16  # such distances are less than this part of the values
 _LEVELS = 12  # value classes of the variance curve
 _BEYOND = 12  # points by which it is carried on
-_QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
+QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
 _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
 _ROUNDED = 0.1  # of that: less is left by no noise
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
@@ -177,16 +177,16 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         curve.append(float(np.median(variance[chosen])))
         quiet.append(chosen)
     ranked = np.argsort(level)
-    level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], _QUANTISATION))
+    level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], QUANTISATION))
     clean = curve_array >= np.array(curve)[ranked] * 0.999
     chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])
-    noisy = chosen[variance[chosen] > _ROUNDED * _QUANTISATION]  # areas of one value say nothing of neighbours
+    noisy = chosen[variance[chosen] > _ROUNDED * QUANTISATION]  # areas of one value say nothing of neighbours
     correlation, hidden = _correlation(rest[noisy], variance[noisy])
     independent = dof / max(float((correlation**2).sum()), 1.0)
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
-    variance = np.maximum(curve_array / bias, max(_QUANTISATION, least))
+    variance = np.maximum(curve_array / bias, max(QUANTISATION, least))
     return NoiseModel(level_array, variance, correlation, floor, ceiling)
 
 
