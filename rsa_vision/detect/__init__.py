@@ -38,7 +38,7 @@ from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import doubt_of_number, resolve_balls
-from rsa_vision.detect.response import BITS, in_film_values, is_straighter, logarithms, scale_matters
+from rsa_vision.detect.response import BITS, in_film_values, is_straighter, log_odds, scale_matters
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
@@ -116,7 +116,7 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
     found = []
     for sign, optics, mine, of_marks in _polarities(values, signs, seeds, pins, candidates, noise):
         if sign > 0 and not as_it_is and scale_matters(mine, of_marks):
-            other, its_noise = logarithms(values, bits, noise)
+            other, its_noise = log_odds(values, bits, noise)
             if is_straighter(values, noise, other, its_noise, mine, optics):
                 detection = _detect(other, BITS, its_noise, limit, as_it_is=True)
                 return replace(detection, images=in_film_values(detection.images, bits))

@@ -1,8 +1,8 @@
-"""Film response undone: films of which the values are light through the film become films of logarithms."""
+"""Film response undone: films of which the values are light through the film become films of its log odds."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,19 +14,22 @@ from rsa_vision.detect.find import fit_at
 from rsa_vision.detect.noise import QUANTISATION, NoiseModel
 from rsa_vision.detect.optics import estimate_optics
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.types import MarkerImages
+from rsa_vision.types import Float, MarkerImages
 
-BITS = 16  # of a film of logarithms
-_HIGH = 0.25  # of its background, the depth of the typical ball: of a lower one the logarithm is as straight as the value
-_NOISE = 0.15  # of the background: of larger noise the logarithm is no longer even about its middle
-_STRAIGHTER = 1.1  # times less that the logarithms leave of a ball's variance
+BITS = 16  # of a film of log odds
+_CLEAR = 1.1  # of full scale: the light where nothing is in its way; nearer to the end of the scale noise would grow without limit
+_HIGH = 0.25  # of its background, the depth of the typical ball: of a lower one the log odds are as straight as the value
+_OVER_NOISE = 10.0  # height of the typical ball in logarithms, over the noise of a pixel: of less, what is bent does not show
+_SIZES = (1.0, 1.6)  # in log odds, where one of them is in values
+_STRAIGHTER = 1.05  # times less that log odds leave of a ball's variance
 
 
-def logarithms(film: NDArray[Any], bits: int, noise: NoiseModel) -> tuple[NDArray[Any], NoiseModel]:
-    """Return the logarithms of film values, spread over 16 bits, and their noise; the ends of the scale stay its ends.
+def log_odds(film: NDArray[Any], bits: int, noise: NoiseModel) -> tuple[NDArray[Any], NoiseModel]:
+    """Return the log odds of the light that passes a film, spread over 16 bits, and their noise; the ends of the scale stay its ends.
 
-    Light through a film is a power of ten of its density, and balls against black film are a hundred times as bright as that: their images
-    are no longer the chord through a ball bent a little. In density, which film records nearly as the logarithm of the exposure, they are.
+    Balls against black film are a hundred times as bright as that: their images are no longer the chord through a ball, bent a little.
+    Where film is dark the logarithm of the light is minus its density, which goes with the logarithm of the exposure. Where it is clear, in
+    the toe of its curve, density goes with a power of the exposure, and is the light that does not pass. The log odds have both ends.
 
     Parameters
     ----------
@@ -37,27 +40,52 @@ def logarithms(film: NDArray[Any], bits: int, noise: NoiseModel) -> tuple[NDArra
 
     Returns
     -------
-    logarithms : ndarray of uint16, shape (rows, cols)
+    log_odds : ndarray of uint16, shape (rows, cols)
     noise : NoiseModel
         To first order.
     """
-    full = 2**bits - 1
-    unit = (2**BITS - 1) / np.log1p(full)
-    table = np.rint(unit * np.log1p(np.arange(full + 1))).astype(np.uint16)
-    level, floor, ceiling = (unit * np.log1p(np.maximum(value, 0.0)) for value in (noise.level, noise.floor, noise.ceiling))
-    variance = noise.variance * np.square(unit / (1 + noise.level)) + QUANTISATION
-    return table[np.minimum(film, full)], NoiseModel(
-        level, variance, noise.correlation, floor if noise.floor >= 0 else noise.floor, ceiling
-    )
+    scale, top = _LogOdds(2**bits - 1), float(2**BITS - 1)
+    level = np.clip(noise.level, 0.0, scale.full)
+    table = np.rint(top * scale.part(np.arange(scale.full + 1.0))).astype(np.uint16)
+    floor, ceiling = (top * float(scale.part(np.array(end))) if 0 <= end <= scale.full else end for end in (noise.floor, noise.ceiling))
+    variance = noise.variance * np.square(top * scale.slope(level)) + QUANTISATION
+    other = NoiseModel(top * scale.part(level), variance, noise.correlation, floor, ceiling)
+    return np.asarray(table[np.minimum(film, scale.full)]), other
+
+
+@dataclass(frozen=True, slots=True)
+class _LogOdds:
+    """Log odds of film values, from 0 to 1 as these go from 0 to the full scale."""
+
+    full: int
+
+    def _odds(self, values: Float) -> Float:
+        return np.asarray(np.log1p(values) - np.log(_CLEAR * self.full - values))
+
+    @property
+    def _ends(self) -> Float:
+        return self._odds(np.array([0.0, self.full]))
+
+    def part(self, values: Float) -> Float:
+        low, high = self._ends
+        return np.asarray((self._odds(values) - low) / (high - low))
+
+    def slope(self, values: Float) -> Float:
+        return np.asarray((1 / (1 + values) + 1 / (_CLEAR * self.full - values)) / np.ptp(self._ends))
+
+    def values(self, part: Float) -> Float:
+        odds = np.exp(self._ends[0] + np.ptp(self._ends) * part)
+        return np.asarray((_CLEAR * self.full * odds - 1) / (1 + odds))
 
 
 def scale_matters(looks: BallFits, noise: NoiseModel) -> bool:
-    """Say whether clear balls are so much brighter than what is around them that logarithms differ from values in more than a factor."""
+    """Say whether clear balls are so much brighter than what is around them that log odds differ from values in more than a factor."""
     clear = looks.rows(look_clear(looks, noise) & (looks.depth > 0) & (looks.background > 0))
     if len(clear.depth) < LEAST_KNOWN:
         return False
-    high, noisy = (np.median(part / clear.background) for part in (clear.depth, np.sqrt(noise.variance_at(clear.background))))
-    return bool(high > _HIGH and noisy < _NOISE)
+    high = clear.depth / clear.background
+    over_noise = np.log1p(high) * clear.background / np.sqrt(noise.variance_at(clear.background))
+    return bool(np.median(high) > _HIGH and np.median(over_noise) > _OVER_NOISE)
 
 
 def is_straighter(
@@ -83,16 +111,18 @@ def is_straighter(
         Clear balls leave less of their variance there.
     """
     clear = looks.rows(look_clear(looks, noise))
-    seeds = fit_at(other, clear.position_px, clear.radius_px, optics, other_noise)
     here = fit_at(film, clear.position_px, clear.radius_px, optics, noise)
-    there = fit_at(other, clear.position_px, clear.radius_px, estimate_optics(other, seeds, other_noise)[0], other_noise)
+    # the brighter a ball against what is around it, the less of it shows in values
+    seeds = [fit_at(other, clear.position_px, size * clear.radius_px, optics, other_noise) for size in _SIZES]
+    closest = min(seeds, key=lambda fits: float(np.median(1 - fits.explained)))
+    its_optics, _ = estimate_optics(other, closest, other_noise)
+    there = fit_at(other, clear.position_px, closest.radius_px, its_optics, other_noise)
     return bool(np.median((1 - here.explained) / np.maximum(1 - there.explained, 1e-9)) > _STRAIGHTER)
 
 
 def in_film_values(images: MarkerImages, bits: int) -> MarkerImages:
-    """Return images measured on logarithms with contrast and background as parts of the film's full scale, which no mark exceeds."""
-    full = 2**bits - 1
-    background, top = (
-        np.expm1(np.log1p(full) * np.minimum(part, 1.0)) / full for part in (images.background, images.background + images.contrast)
-    )
+    """Return images measured on log odds with contrast and background as parts of the film's full scale, which no mark exceeds."""
+    scale = _LogOdds(2**bits - 1)
+    ends = (images.background, images.background + images.contrast)
+    background, top = (scale.values(np.minimum(end, 1.0)) / scale.full for end in ends)
     return replace(images, contrast=top - background, background=background)
