@@ -47,7 +47,7 @@ def log_odds(film: NDArray[Any], bits: int, noise: NoiseModel) -> tuple[NDArray[
     scale, top = _LogOdds(2**bits - 1), float(2**BITS - 1)
     level = np.clip(noise.level, 0.0, scale.full)
     table = np.rint(top * scale.part(np.arange(scale.full + 1.0))).astype(np.uint16)
-    floor, ceiling = (top * float(scale.part(np.array(end))) if 0 <= end <= scale.full else end for end in (noise.floor, noise.ceiling))
+    floor, ceiling = (float(table[int(end)]) if 0 <= end <= scale.full else end for end in (noise.floor, noise.ceiling))
     variance = noise.variance * np.square(top * scale.slope(level)) + QUANTISATION
     other = NoiseModel(top * scale.part(level), variance, noise.correlation, floor, ceiling)
     return np.asarray(table[np.minimum(film, scale.full)]), other
