@@ -29,7 +29,7 @@ from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.random_effects import Common, Solution, Windows, hold, solve, variance_of
 from rsa_vision.detect.specks import Specks, find_specks
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
-from rsa_vision.detect.usual import proportion, usual_size
+from rsa_vision.detect.usual import proportion, size_unlike, usual_size
 from rsa_vision.types import Bool, Float, Int
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
@@ -90,11 +90,12 @@ def settle(
     structure = np.where(free[:, None], around.structure, 0.0)
     alone, level = free & ~edged & (balls.chi2_ring < EDGE), mean_beside(places, len(free))
     told = alone & np.isfinite(level)
+    clear = balls.rows(alone & (balls.chi2_ring < STRUCTURE))
     common = Common(
         optics,
         noise,
         under,
-        usual_size(balls.rows(alone & (balls.chi2_ring < STRUCTURE))),
+        usual_size(clear),
         proportion(balls.depth[told], balls.background[told], level[told]),
         around.differ,
     )
@@ -126,6 +127,7 @@ def settle(
             by_background = solution.estimator * solution.shade
             errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
         ratios.append(errors)
+    out.covariance[edged, :2, :2] += size_unlike(balls.rows(edged), clear)[:, None, None] * np.eye(2)
     return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], covered > MOST_COVERED
 
 

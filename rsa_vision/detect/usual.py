@@ -14,6 +14,7 @@ _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
 _LEAST_VALUE = 1.0  # of a film
 _OUTLIER = 3.0
+_LEAST_SIZES = 3  # balls that tell which sizes there are
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,17 @@ def usual_size(clear: BallFits) -> Size:
     """Return the size of these balls, with what they truly differ by."""
     centre, spread, _ = true_spread(np.log(clear.radius_px), clear.covariance[:, 2, 2] / clear.radius_px**2)
     return Size(centre, min(spread, _ANYTHING))
+
+
+def size_unlike(balls: BallFits, clear: BallFits) -> Float:
+    """Return by how much the radii of balls differ from the nearest ones of clear balls, squared, beyond what errors explain; shape (n,).
+
+    What pulls at a radius, as a corner or a second edge beside a ball does, pulls at its centre as much.
+    """
+    if len(clear.depth) < _LEAST_SIZES:
+        return np.zeros(len(balls.depth))
+    gap = np.square(balls.radius_px[:, None] - clear.radius_px)
+    return np.asarray(np.maximum(gap - balls.covariance[:, None, 2, 2] - clear.covariance[:, 2, 2], 0.0).min(axis=1))
 
 
 @dataclass(frozen=True, slots=True)
