@@ -35,12 +35,13 @@ from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.painted import paint
-from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
+from rsa_vision.detect.pins import MOST_STROKES, find_pins, is_slim, look_for_pins, on_arms, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import doubt_of_number, resolve_balls
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
+from rsa_vision.detect.strokes import at_junctions
 from rsa_vision.detect.surroundings import free_places
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.flags import MarkerFlag
@@ -105,7 +106,10 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     limit = significance_limit(values.size, 2.5, false_detections)
     faint = find_candidates(values, STRENGTH, noise)
     candidates = faint.rows(np.abs(faint.strength) > STRENGTH)
-    pins = look_for_pins(values, candidates.strokes, noise)
+    # strokes at junctions are arms of tees, most likely: they are looked at once it is known that there are none
+    strokes = candidates.strokes[:MOST_STROKES]
+    arms = at_junctions(strokes, candidates.junctions)
+    pins, candidates = look_for_pins(values, strokes[~arms], noise), replace(candidates, strokes=strokes[arms])
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = [
         _one_polarity(values, bits, sign, optics, mine, pins, candidates, faint, of_marks, limit)
@@ -164,7 +168,9 @@ def _polarities(
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
-            of_pins, balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
+            of_pins, balls = optics_of_pins(
+                film, [p for p in pins + look_for_pins(film, candidates.strokes, noise) if np.sign(p.depth) == sign], noise
+            )
             if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
                 optics[sign] = of_pins
         weight[sign] = balls + _of_tees(candidates, sign)
@@ -191,6 +197,7 @@ def _one_polarity(
     tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]
+    rough_pins = rough_pins + look_for_pins(film, candidates.strokes[~on_arms(candidates.strokes[:, :2], tees)], noise)
     pins, pin_optics = find_pins(film, [p for p in rough_pins if np.sign(p.depth) == sign], tees, optics, noise)
 
     needles = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
