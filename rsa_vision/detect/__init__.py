@@ -131,7 +131,10 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
     evidence = {this: ball_evidence(distinct(fits, noise), noise) for this, fits in looks.items()}
     best = max(evidence, key=lambda this: evidence[this])
     needles = {
-        this: sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == this) + _of_tees(candidates, this) for this in looks
+        this: sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == this)
+        + _of_tees(candidates, this)
+        + _of_arms(candidates.strokes, this)
+        for this in looks
     }
     rest = ~np.isin(np.arange(len(sign)), np.concatenate(list(strongest.values())))
     if evidence[best] + needles[best] > _BEYOND_DOUBT and evidence[-best] < _NO_RIVAL and needles[-best] < _NO_RIVAL_OF_NEEDLES:
@@ -148,6 +151,12 @@ def _look(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noi
 def _of_tees(candidates: Candidates, sign: int) -> float:
     """Evidence of junctions for tees of one polarity."""
     return float(np.clip(-sign * candidates.junctions[:, 4] - CLEAR_JUNCTION, 0.0, 20.0).sum())
+
+
+def _of_arms(strokes: Float, sign: int) -> float:
+    """The same of strokes at junctions."""
+    strength = -sign * STRENGTH * strokes[:, 5]
+    return float(np.clip(strength, 0.0, _CAP).sum())
 
 
 def _polarities(
