@@ -144,7 +144,10 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
 
 
 def _look(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> BallFits:
-    fits = first_look(film, candidates, noise)
+    return _off_pins(first_look(film, candidates, noise), pins)
+
+
+def _off_pins(fits: BallFits, pins: list[NeedleFit]) -> BallFits:
     return fits.rows(~on_pins(fits.position_px, 1 - fits.explained, [p for p in pins if is_slim(p)]))
 
 
@@ -206,8 +209,9 @@ def _one_polarity(
     tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]
-    rough_pins = rough_pins + look_for_pins(film, candidates.strokes[~on_arms(candidates.strokes[:, :2], tees)], noise)
-    pins, pin_optics = find_pins(film, [p for p in rough_pins if np.sign(p.depth) == sign], tees, optics, noise)
+    more_pins = look_for_pins(film, candidates.strokes[~on_arms(candidates.strokes[:, :2], tees)], noise)
+    seeds = _off_pins(seeds, more_pins)
+    pins, pin_optics = find_pins(film, [p for p in rough_pins + more_pins if np.sign(p.depth) == sign], tees, optics, noise)
 
     needles = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
 
