@@ -286,11 +286,11 @@ def influence_covariance(influence: NDArray[Any], correlation: Float) -> Float:
     ndarray of shape (..., p, p)
     """
     # by Parseval's theorem in the frequency domain, where the columns of the half spectrum but the first and the middle one stand for two
-    size = tuple(next_fast_len(n + len(correlation), real=True) for n in influence.shape[-2:])
+    size = tuple(next_fast_len(n + len(correlation) // 2, real=True) for n in influence.shape[-2:])
     # to six digits, in half the time of double precision
     spectrum = rfft2(influence.astype(np.float32), s=size).reshape(*influence.shape[:-2], -1)
-    weighted = spectrum * _power(correlation.tobytes(), len(correlation), size)
-    return np.asarray(np.matmul(weighted, spectrum.conj().swapaxes(-1, -2)).real, np.float64)
+    weighted = (spectrum * _root_of_power(correlation.tobytes(), len(correlation), size)).view(np.float32)  # real and imaginary parts
+    return np.asarray(np.matmul(weighted, weighted.swapaxes(-1, -2)), np.float64)
 
 
 def power_spectrum(correlation: Float, size: tuple[int, ...]) -> Float:
@@ -301,8 +301,8 @@ def power_spectrum(correlation: Float, size: tuple[int, ...]) -> Float:
 
 
 @lru_cache(maxsize=64)
-def _power(correlation: bytes, side: int, size: tuple[int, ...]) -> Float:
-    """Return the power of correlated noise at the frequencies of ``rfft2``, for sums over the half spectrum to be sums over pixels."""
+def _root_of_power(correlation: bytes, side: int, size: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return the root of the power of correlated noise at the frequencies of ``rfft2``; sums over the half spectrum are sums over pixels."""
     power = np.maximum(power_spectrum(np.frombuffer(correlation).reshape(side, side), size), 0.0) / np.prod(size)
     power[:, 1 : (size[1] + 1) // 2] *= 2
-    return np.asarray(power.ravel(), np.float32)
+    return np.sqrt(power.ravel()).astype(np.float32)
