@@ -130,10 +130,10 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work:
         place = np.flatnonzero((significance > FAINT) | (significance < -FAINT))
         strength = np.asarray(significance.ravel()[place], np.float64)
         out.append(_extrema(answer, place, threshold * strength, level, radius))
+        clear = np.abs(strength) > 1
         if (level, radius) == JUNCTION_SCALE:
-            junctions = find_junctions(significance, level)
+            junctions = find_junctions(significance, place[clear], strength[clear], level)
         if (level, radius) in STROKE_SCALES:
-            clear = np.abs(strength) > 1
             strokes.append(find_strokes(answer, place[clear], strength[clear], level))
     return np.concatenate(out), junctions, np.concatenate(strokes)
 

@@ -302,7 +302,7 @@ def power_spectrum(correlation: Float, size: tuple[int, ...]) -> Float:
 
 @lru_cache(maxsize=64)
 def _root_of_power(correlation: bytes, side: int, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return the root of the power of correlated noise at the frequencies of ``rfft2``; sums over the half spectrum are sums over pixels."""
+    """Return the root of the power of correlated noise at the frequencies of ``rfft2``, so that sums over half of them are whole."""
     power = np.maximum(power_spectrum(np.frombuffer(correlation).reshape(side, side), size), 0.0) / np.prod(size)
     power[:, 1 : (size[1] + 1) // 2] *= 2
     return np.sqrt(power.ravel()).astype(np.float32)
