@@ -174,9 +174,8 @@ def fit_crossing(
         delta = step_of(gram, theta, tees.shape[1] - 1, 1e-3 if step < 4 else 1e-6).reshape(len(now), -1)
         if step in (2, 6):
             weight = 1.0 / noise.variance_at(theta @ linear + window.beside)
-        scale = min(1.0, 1.0 / max(float(np.abs(delta[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(delta[:, -1]).max()), 1e-9))
-        before, now = now, [_moved(f, scale * d, half) for f, d in zip(now, delta, strict=True)]
-        converged = step > 0 and float(np.abs(delta[:, :2]).max()) < near
+        before, now = now, moved(now, delta, half)
+        converged = (step > 0 or quick) and float(np.abs(delta[:, :2]).max()) < near
     return told()
 
 
@@ -204,6 +203,25 @@ def _change(before: Sequence[NeedleFit], now: Sequence[NeedleFit]) -> Float:
     """By how much tips, half widths, lengths and directions have moved, shape (needles, 5)."""
     at, was = (np.array([[*f.position_px, f.shape.half_width_px, f.shape.length_px, f.angles[0]] for f in fits]) for fits in (now, before))
     return np.asarray(at - was)
+
+
+def moved(needles: Sequence[NeedleFit], by: Float, half: int) -> list[NeedleFit]:
+    """Return needles after a step, or after the part of it that is not too far at once.
+
+    Parameters
+    ----------
+    needles : sequence of NeedleFit
+    by : ndarray of shape (needles, 5)
+        Steps of tip (col, row), half width, length and direction.
+    half : int
+        Half the side of their window.
+
+    Returns
+    -------
+    list of NeedleFit
+    """
+    scale = min(1.0, 1.0 / max(float(np.abs(by[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(by[:, -1]).max()), 1e-9))
+    return [_moved(f, scale * d, half) for f, d in zip(needles, by, strict=True)]
 
 
 def _moved(fit: NeedleFit, delta: Float, half: int) -> NeedleFit:

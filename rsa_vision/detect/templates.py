@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import polynomial
-from rsa_vision.detect.needle_images import NeedleFit, needle_image, support
+from rsa_vision.detect.needle_images import NeedleFit, arm_images, needle_image, support
 from rsa_vision.detect.needles import PROMISING, under
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
@@ -79,8 +79,10 @@ def _correlation(image: NDArray[np.float32], template: NDArray[np.float32]) -> N
     return np.asarray(cv2.divide(product, spread, dst=product, scale=1 / (side * float(np.linalg.norm(bare)))))
 
 
-def promising(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optics, noise: NoiseModel) -> Bool:
+def promising(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optics, noise: NoiseModel) -> tuple[Bool, Float]:
     """Say at which places the image of a known tee, on a quadratic background, explains a part of what lies under it.
+
+    The first step from there to the best fit comes with it.
 
     Parameters
     ----------
@@ -93,18 +95,23 @@ def promising(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optic
 
     Returns
     -------
-    ndarray of bool, shape (n,)
+    worth : ndarray of bool, shape (n,)
+    step : ndarray of shape (n, 5)
+        Of tip (col, row), half width, length and direction.
     """
     half = int(known.shape.length_px + 3 * optics.sigma_px) + 1
     axis = np.arange(-half, half + 1.0)
     row, col = np.nonzero(support(axis - 0.5, axis - 0.5, known.angles, known.shape, 3 * optics.sigma_px)) - np.array(half)
-    image = needle_image(col - 0.5, row - 0.5, known, optics)
+    image, *slopes = arm_images(col - 0.5, row - 0.5, known.angles, known.shape, optics).sum(1)
     cols, rows = ((np.floor(at)[:, None] + step).astype(np.intp) for at, step in zip(places.T, (col, row), strict=False))
     values = film[rows.clip(0, film.shape[0] - 1), cols.clip(0, film.shape[1] - 1)].astype(np.float64)
-    basis = np.vstack([image, polynomial(half, col, row).T])
+    basis = np.vstack([image, polynomial(half, col, row).T, *slopes])
+    step = values @ np.linalg.pinv(basis)
+    basis = basis[: -len(slopes)]
     theta = values @ np.linalg.pinv(basis)
     core = under(image)
     residual = (values - theta @ basis)[:, core]
     left, all_of_it = (np.square(part).mean(1) for part in (residual, residual + theta[:, :1] * image[core]))
     alone = noise.variance_at(theta[:, 1])
-    return np.asarray((left < (1 - PROMISING) * all_of_it) | (left - alone < (1 - PROMISING) * np.maximum(all_of_it - alone, 0.0)))
+    worth = (left < (1 - PROMISING) * all_of_it) | (left - alone < (1 - PROMISING) * np.maximum(all_of_it - alone, 0.0))
+    return worth, step[:, -len(slopes) :] / theta[:, :1]
