@@ -26,7 +26,9 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 _STEPS = 8
-_CONVERGED = 0.15  # root mean square over the tips, in standard deviations: by that little a few go to and fro for ever
+# root mean square over the tips of pins and of tees, in standard deviations: by the former a few go to and fro for ever; three arms hold a
+# tip, so that after the latter the next step is a quarter of that
+_CONVERGED = {1: 0.15, 3: 0.25}
 _FINEST_PX = 0.02  # added to those, for the tables are interpolated
 _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
 _TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
@@ -103,7 +105,7 @@ def fit_shared(
             change[:OPTICS] = 0.0  # new tables for so little are not worth their time
         moves = [e.step(change) for e in systems]
         surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, moves, strict=True)])
-        converged = step > 0 and float(surprise.mean()) < _CONVERGED**2
+        converged = step > 0 and float(surprise.mean()) < _CONVERGED[len(needles[0].angles)] ** 2
         if converged and not alike:
             break  # from so near the last step gets there as well; that to the sizes of all is longer
         moved += change
