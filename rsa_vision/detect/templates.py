@@ -68,15 +68,20 @@ def find_like(film: NDArray[Any], template: NDArray[np.float32]) -> Float:
 
 
 def _correlation(image: NDArray[np.float32], template: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Correlation coefficient with all windows of an image; by moments from running sums it takes two thirds of OpenCV's own time."""
+    """Correlation coefficient with all windows of an image, whose spread changes slowly from place to place: every second one tells it."""
     side, bare = len(template), template - template.mean()
     image = image - image[::_SPARSE, ::_SPARSE].mean()
     product = cv2.matchTemplate(image, bare, cv2.TM_CCORR)
-    inside = slice(side // 2, -(side // 2))
-    mean, square = (m(image, cv2.CV_64F, (side, side)) for m in (cv2.boxFilter, cv2.sqrBoxFilter))
-    variance = cv2.subtract(square, cv2.multiply(mean, mean, dst=mean), dtype=cv2.CV_32F)[inside, inside]
-    spread = cv2.sqrt(np.maximum(variance, np.float32(_LEAST_VARIANCE), out=variance))
-    return np.asarray(cv2.divide(product, spread, dst=product, scale=1 / (side * float(np.linalg.norm(bare)))))
+    even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
+    twice, box = even.shape[::-1], (side // 2 + 1) // 2 * 2 + 1  # odd, of about as many pixels as the template
+    mean, square = (
+        cv2.boxFilter(cv2.resize(of, (twice[0] // 2, twice[1] // 2), interpolation=cv2.INTER_AREA), cv2.CV_64F, (box, box))
+        for of in (even, cv2.multiply(even, even))
+    )
+    variance = cv2.subtract(square, cv2.multiply(mean, mean, dst=mean), dtype=cv2.CV_32F)
+    spread = cv2.resize(cv2.sqrt(np.maximum(variance, np.float32(_LEAST_VARIANCE))), twice, interpolation=cv2.INTER_LINEAR)
+    inside = tuple(slice(side // 2, side // 2 + n) for n in product.shape)
+    return np.asarray(cv2.divide(product, spread[inside], dst=product, scale=1 / (side * float(np.linalg.norm(bare)))))
 
 
 def promising(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optics, noise: NoiseModel) -> tuple[Bool, Float]:
