@@ -126,8 +126,9 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
     def look(index: Any) -> BallFits:
         return _look(film, candidates.rows(index), pins, noise)
 
-    strongest = {this: np.flatnonzero(sign == this)[:_STRONGEST] for this in (-1, 1)}
-    looks = {this: look(index) for this, index in strongest.items()}
+    strongest = np.concatenate([np.flatnonzero(sign == this)[:_STRONGEST] for this in (-1, 1)])
+    first = look(strongest)
+    looks = {this: first.rows(np.sign(first.depth) == this) for this in (-1, 1)}
     evidence = {this: ball_evidence(distinct(fits, noise), noise) for this, fits in looks.items()}
     best = max(evidence, key=lambda this: evidence[this])
     needles = {
@@ -136,7 +137,7 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
         + _of_arms(candidates.strokes, this)
         for this in looks
     }
-    rest = ~np.isin(np.arange(len(sign)), np.concatenate(list(strongest.values())))
+    rest = ~np.isin(np.arange(len(sign)), strongest)
     if evidence[best] + needles[best] > _BEYOND_DOUBT and evidence[-best] < _NO_RIVAL and needles[-best] < _NO_RIVAL_OF_NEEDLES:
         del looks[-best]
         rest &= sign == best
