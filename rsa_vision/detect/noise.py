@@ -159,16 +159,18 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
         if np.count_nonzero(whole) >= ENOUGH_TILES:
             break
-    tiles = (tiles[whole] if whole.any() else tiles).astype(np.float64)
+    tiles = tiles[whole] if whole.any() else tiles
     side = tiles.shape[1]
     axis = np.linspace(-1, 1, side)
     gx, gy = np.meshgrid(axis, axis)
     basis = np.linalg.qr(np.stack([b.ravel() for b in (np.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy)], axis=1))[0]
     flat = tiles.reshape(len(tiles), -1)
-    rest = flat - (flat @ basis) @ basis.T
-    dof = side * side - basis.shape[1]
-    variance = np.einsum("ij,ij->i", rest, rest) / dof
     mean = medians(flat)  # a mark in a tile must not make it a level of its own
+    rest = flat.astype(np.float32) - mean[:, None].astype(np.float32)  # single precision does once the level is off
+    single = basis.astype(np.float32)
+    rest -= (rest @ single) @ single.T
+    dof = side * side - basis.shape[1]
+    variance = np.einsum("ij,ij->i", rest, rest).astype(np.float64) / dof
     order = np.argsort(mean)
     level, curve, quiet = [], [], []
     for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
@@ -201,7 +203,7 @@ def medians(values: NDArray[Any]) -> NDArray[Any]:
     half = values.shape[-1] // 2
     parted = np.partition(values, half)
     upper = parted[..., half]
-    return np.asarray(upper if values.shape[-1] % 2 else (upper + parted[..., :half].max(-1)) / 2)
+    return np.asarray(upper if values.shape[-1] % 2 else upper / 2 + parted[..., :half].max(-1) / 2)
 
 
 def _smooth(level: Float, variance: Float) -> Float:
