@@ -35,13 +35,14 @@ from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.optics import ball_evidence, estimate_optics
 from rsa_vision.detect.painted import paint
-from rsa_vision.detect.pins import find_pins, is_slim, look_for_pins, on_pins, optics_of_pins
+from rsa_vision.detect.pins import MOST_STROKES, find_pins, is_slim, look_for_pins, on_arms, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import doubt_of_number, resolve_balls
 from rsa_vision.detect.response import BITS, in_film_values, is_straighter, log_odds, scale_matters
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
+from rsa_vision.detect.strokes import at_junctions
 from rsa_vision.detect.surroundings import free_places
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.flags import MarkerFlag
@@ -111,7 +112,10 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
     """``as_it_is``: in no other scale of the values."""
     faint = find_candidates(values, STRENGTH, noise)
     candidates = faint.rows(np.abs(faint.strength) > STRENGTH)
-    pins = look_for_pins(values, candidates.strokes, noise)
+    # strokes at junctions are arms of tees, most likely: they are looked at once it is known that there are none
+    strokes = candidates.strokes[:MOST_STROKES]
+    arms = at_junctions(strokes, candidates.junctions)
+    pins, candidates = look_for_pins(values, strokes[~arms], noise), replace(candidates, strokes=strokes[arms])
     seeds, signs = _seeds(values, candidates, pins, noise)
     found = []
     for sign, optics, mine, of_marks in _polarities(values, signs, seeds, pins, candidates, noise):
@@ -132,14 +136,18 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
     def look(index: Any) -> BallFits:
         return _look(film, candidates.rows(index), pins, noise)
 
-    strongest = {this: np.flatnonzero(sign == this)[:_STRONGEST] for this in (-1, 1)}
-    looks = {this: look(index) for this, index in strongest.items()}
+    strongest = np.concatenate([np.flatnonzero(sign == this)[:_STRONGEST] for this in (-1, 1)])
+    first = look(strongest)
+    looks = {this: first.rows(np.sign(first.depth) == this) for this in (-1, 1)}
     evidence = {this: ball_evidence(distinct(fits, noise), noise) for this, fits in looks.items()}
     best = max(evidence, key=lambda this: evidence[this])
     needles = {
-        this: sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == this) + _of_tees(candidates, this) for this in looks
+        this: sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == this)
+        + _of_tees(candidates, this)
+        + _of_arms(candidates.strokes, this)
+        for this in looks
     }
-    rest = ~np.isin(np.arange(len(sign)), np.concatenate(list(strongest.values())))
+    rest = ~np.isin(np.arange(len(sign)), strongest)
     if evidence[best] + needles[best] > _BEYOND_DOUBT and evidence[-best] < _NO_RIVAL and needles[-best] < _NO_RIVAL_OF_NEEDLES:
         del looks[-best]
         rest &= sign == best
@@ -147,13 +155,22 @@ def _seeds(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], no
 
 
 def _look(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> BallFits:
-    fits = first_look(film, candidates, noise)
+    return _off_pins(first_look(film, candidates, noise), pins)
+
+
+def _off_pins(fits: BallFits, pins: list[NeedleFit]) -> BallFits:
     return fits.rows(~on_pins(fits.position_px, 1 - fits.explained, [p for p in pins if is_slim(p)]))
 
 
 def _of_tees(candidates: Candidates, sign: int) -> float:
     """Evidence of junctions for tees of one polarity."""
     return float(np.clip(-sign * candidates.junctions[:, 4] - CLEAR_JUNCTION, 0.0, 20.0).sum())
+
+
+def _of_arms(strokes: Float, sign: int) -> float:
+    """The same of strokes at junctions."""
+    strength = -sign * STRENGTH * strokes[:, 5]
+    return float(np.clip(strength, 0.0, _CAP).sum())
 
 
 def _polarities(
@@ -174,7 +191,9 @@ def _polarities(
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
-            of_pins, balls = optics_of_pins(film, [p for p in pins if np.sign(p.depth) == sign], noise)
+            of_pins, balls = optics_of_pins(
+                film, [p for p in pins + look_for_pins(film, candidates.strokes, noise) if np.sign(p.depth) == sign], noise
+            )
             if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
                 optics[sign] = of_pins
         weight[sign] = balls + _of_tees(candidates, sign)
@@ -201,7 +220,9 @@ def _one_polarity(
     tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]
-    pins, pin_optics = find_pins(film, [p for p in rough_pins if np.sign(p.depth) == sign], tees, optics, noise)
+    more_pins = look_for_pins(film, candidates.strokes[~on_arms(candidates.strokes[:, :2], tees)], noise)
+    seeds = _off_pins(seeds, more_pins)
+    pins, pin_optics = find_pins(film, [p for p in rough_pins + more_pins if np.sign(p.depth) == sign], tees, optics, noise)
 
     needles = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
 

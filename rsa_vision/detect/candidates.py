@@ -48,7 +48,7 @@ class Candidates:
     junctions : ndarray of shape (m, 5)
         Points where three arms may meet, as :func:`rsa_vision.detect.junctions.find_junctions`.
     strokes : ndarray of shape (k, 6)
-        What may be single pins, as :func:`rsa_vision.detect.strokes.find_strokes`.
+        What may be single pins, strongest first, as :func:`rsa_vision.detect.strokes.find_strokes`.
     """
 
     position_px: Float
@@ -96,7 +96,9 @@ def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> 
             into.append(table[(table[:, 1] >= start) & (table[:, 1] < stop)])
     table = np.concatenate(found)
     table = table[np.argsort(-np.abs(table[:, 3]))]
-    return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], np.concatenate(junctions), np.concatenate(strokes))
+    strokes_found = np.concatenate(strokes)
+    strokes_found = strokes_found[np.argsort(-np.abs(strokes_found[:, 5]))]
+    return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], np.concatenate(junctions), strokes_found)
 
 
 def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work: NDArray[np.float32]) -> tuple[Float, Float, Float]:
@@ -128,10 +130,10 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work:
         place = np.flatnonzero((significance > FAINT) | (significance < -FAINT))
         strength = np.asarray(significance.ravel()[place], np.float64)
         out.append(_extrema(answer, place, threshold * strength, level, radius))
+        clear = np.abs(strength) > 1
         if (level, radius) == JUNCTION_SCALE:
-            junctions = find_junctions(significance, level)
+            junctions = find_junctions(significance, place[clear], strength[clear], level)
         if (level, radius) in STROKE_SCALES:
-            clear = np.abs(strength) > 1
             strokes.append(find_strokes(answer, place[clear], strength[clear], level))
     return np.concatenate(out), junctions, np.concatenate(strokes)
 

@@ -20,6 +20,7 @@ from rsa_vision.types import Float, Int
 
 _STEPS, _QUICK_STEPS = 16, 5
 _CONVERGED_PX = 0.02  # a step's change: what is left after it is a tenth of that, and the last fit follows
+_NEAR_PX = 0.1  # enough for a first look
 _AROUND_PX = 4.0  # beyond three blurs from the arms, which tell the background
 _LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
 _GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
@@ -135,10 +136,11 @@ def fit_crossing(
     """
     now = list(needles)
     window = window_of(film, now, optics, noise, others)
-    steps = min(steps, _QUICK_STEPS) if quick else steps
+    steps, near = (min(steps, _QUICK_STEPS), _NEAR_PX) if quick else (steps, _CONVERGED_PX)
     cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.half
     weight = 1.0 / noise.variance_at(data + window.beside)
-    converged = False
+    before, converged = now, False
+    tees: Float = np.zeros((len(now), 1, len(data)))  # needles, (image, its derivatives), pixels
     ground = np.zeros(len(data))  # background above its mean under each pixel
 
     def told() -> list[NeedleFit]:
@@ -150,11 +152,14 @@ def fit_crossing(
 
     for step in range(steps + 1):
         last = step == steps or converged  # nobody asks where to go next
-        offsets = [(cols - f.position_px[0], rows - f.position_px[1]) for f in now]
-        blocks = [arm_images(*at, f.angles, f.shape, optics, slopes=not last) for at, f in zip(offsets, now, strict=True)]
-        if optics.proportion:
-            blocks = [block * gain_at(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
-        tees = np.array([block.sum(1) for block in blocks])  # needles, (image, its derivatives), pixels
+        if converged:  # so small a step goes into the images linearly
+            tees = tees[:, :1] + np.matmul(_change(before, now)[:, None], tees[:, 1:])
+        else:
+            offsets = [(cols - f.position_px[0], rows - f.position_px[1]) for f in now]
+            blocks = [arm_images(*at, f.angles, f.shape, optics, slopes=not last) for at, f in zip(offsets, now, strict=True)]
+            if optics.proportion:
+                blocks = [block * gain_at(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
+            tees = np.array([block.sum(1) for block in blocks])
         moves = tees[:, 1:].reshape(-1, len(data))
         linear = np.concatenate([tees[:, 0], *lapping(tees[:, 0]), surface])
         weighted = np.concatenate([moves, linear, data[None]]) * np.sqrt(weight)
@@ -169,9 +174,8 @@ def fit_crossing(
         delta = step_of(gram, theta, tees.shape[1] - 1, 1e-3 if step < 4 else 1e-6).reshape(len(now), -1)
         if step in (2, 6):
             weight = 1.0 / noise.variance_at(theta @ linear + window.beside)
-        scale = min(1.0, 1.0 / max(float(np.abs(delta[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(delta[:, -1]).max()), 1e-9))
-        now = [_moved(f, scale * d, half) for f, d in zip(now, delta, strict=True)]
-        converged = step > 0 and float(np.abs(delta[:, :2]).max()) < _CONVERGED_PX
+        before, now = now, moved(now, delta, half)
+        converged = (step > 0 or quick) and float(np.abs(delta[:, :2]).max()) < near
     return told()
 
 
@@ -193,6 +197,31 @@ def gain_at(fit: NeedleFit, ground: Float, optics: Optics) -> Float | float:
         return 1.0
     gain: Float = np.clip(1.0 + optics.proportion * ground / fit.depth, *_GAIN)
     return gain
+
+
+def _change(before: Sequence[NeedleFit], now: Sequence[NeedleFit]) -> Float:
+    """By how much tips, half widths, lengths and directions have moved, shape (needles, 5)."""
+    at, was = (np.array([[*f.position_px, f.shape.half_width_px, f.shape.length_px, f.angles[0]] for f in fits]) for fits in (now, before))
+    return np.asarray(at - was)
+
+
+def moved(needles: Sequence[NeedleFit], by: Float, half: int) -> list[NeedleFit]:
+    """Return needles after a step, or after the part of it that is not too far at once.
+
+    Parameters
+    ----------
+    needles : sequence of NeedleFit
+    by : ndarray of shape (needles, 5)
+        Steps of tip (col, row), half width, length and direction.
+    half : int
+        Half the side of their window.
+
+    Returns
+    -------
+    list of NeedleFit
+    """
+    scale = min(1.0, 1.0 / max(float(np.abs(by[:, :2]).max()), 1e-9), 0.1 / max(float(np.abs(by[:, -1]).max()), 1e-9))
+    return [_moved(f, scale * d, half) for f, d in zip(needles, by, strict=True)]
 
 
 def _moved(fit: NeedleFit, delta: Float, half: int) -> NeedleFit:

@@ -19,6 +19,7 @@ from rsa_vision.types import Bool, Float
 
 BATCH = 48  # windows that stay in the cache
 _LIKE = 1.25  # ratio of their sizes
+_PADDED = 10_000  # pixels by which smaller ones may be too large besides: another batch costs as much
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
@@ -68,7 +69,9 @@ def fit_at(
     while begin < len(order):
         # windows of nearly one size at once; what of them is not a smaller one's is masked
         index = order[begin : begin + BATCH]
-        index = index[halves[index] <= _LIKE * halves[index[0]]]
+        sides = 2 * halves[index] + 1
+        padded = np.arange(len(index)) * sides**2 - np.cumsum(np.append(0, sides[:-1] ** 2))
+        index = index[: int(((sides <= _LIKE * sides[0]) | (padded <= _PADDED)).argmin()) or len(index)]
         begin += len(index)
         patches = cut(film, position_px[index], int(halves[index[-1]]), noise)
         extra = None

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.types import Float
+from rsa_vision.types import Float, Int
 
 RINGS_PX = (6.0, 9.0, 13.0, 19.0)  # film pixels; a tee shows on the rings that lie within its arms
 DIRECTIONS = 24
@@ -23,13 +23,17 @@ _APART = 4  # pixels of the answer; of junctions nearer than this, the best
 _GAP = 0.5  # between the arms the answer may reach this part of the weakest arm
 
 
-def find_junctions(answer: NDArray[Any], level: int) -> Float:
+def find_junctions(answer: NDArray[Any], place: Int, strength: Float, level: int) -> Float:
     """Find points with three arms in the shape of a T.
 
     Parameters
     ----------
     answer : ndarray of shape (rows, cols)
         Filter answer of one pyramid level in units of what counts as significant; positive for dark marks.
+    place : ndarray of int, shape (k,)
+        Where it is significant.
+    strength : ndarray of shape (k,)
+        Answer there.
     level : int
         Pyramid level.
 
@@ -39,28 +43,27 @@ def find_junctions(answer: NDArray[Any], level: int) -> Float:
         col_px, row_px, angle of the stem (radians, counter-clockwise as displayed), ring radius in film pixels, strength (score); negative
         strength for bright marks.
     """
-    margin = int(RINGS_PX[-1] / 2**level) + 1
-    around = cv2.copyMakeBorder(answer, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-    found = [_one_polarity(around, sign, margin, level) for sign in (1, -1)]
-    return np.concatenate(found)
+    return np.concatenate([_one_polarity(answer, place[mine], sign, level) for sign, mine in ((1, strength > 0), (-1, strength < 0))])
 
 
-def _one_polarity(scaled: NDArray[Any], sign: int, margin: int, level: int) -> Float:
+def _one_polarity(scaled: NDArray[Any], place: Int, sign: int, level: int) -> Float:
     size = 2**level
-    inside = scaled[margin:-margin, margin:-margin]
-    strong = (inside > 1 if sign > 0 else inside < -1).astype(np.uint8)
-    if not strong.any():
-        return np.zeros((0, 5))
+    margin = int(RINGS_PX[-1] / size) + 1  # of the film; bands overlap
     # the tips fade out, so the centre itself may answer weakly: look a little around what answers
-    row, col = np.divmod(np.flatnonzero(cv2.dilate(strong, np.ones((5, 5), np.uint8)).view(bool)), strong.shape[1])
+    strong = np.zeros(scaled.shape, np.uint8)
+    strong.ravel()[place] = 1
+    looked = np.asarray(cv2.dilate(strong, np.ones((5, 5), np.uint8)))
+    for edge in (looked[:margin], looked[-margin:], looked[:, :margin], looked[:, -margin:]):
+        edge[:] = 0
+    at = np.flatnonzero(looked.view(bool))
     theta = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     quarter, eighth = DIRECTIONS // 4, DIRECTIONS // 8
-    best, angle, ring = np.zeros((3, len(row)), np.float32)
+    best, angle, ring = np.zeros((3, len(at)), np.float32)
     around_c, around_r = (np.rint(np.outer(RINGS_PX, way) / size).astype(np.intp) for way in (np.cos(theta), -np.sin(theta)))
     for radius, offset in zip(RINGS_PX, around_r * scaled.shape[1] + around_c, strict=True):
-        for begin in range(0, len(row), _CHUNK):
-            point = np.arange(begin, min(begin + _CHUNK, len(row)))
-            samples = scaled.ravel().take((row[point] + margin) * scaled.shape[1] + col[point] + margin + offset[:, None])
+        for begin in range(0, len(at), _CHUNK):
+            point = np.arange(begin, min(begin + _CHUNK, len(at)))
+            samples = scaled.ravel().take(at[point] + offset[:, None])
             # three arms that are strong enough: most points can be left out before their scores are formed
             arm = _turned(_widened(samples > LEAST if sign > 0 else samples < -LEAST))
             worth = (arm(0) & arm(quarter) & arm(-quarter)).any(0)
@@ -77,8 +80,9 @@ def _one_polarity(scaled: NDArray[Any], sign: int, margin: int, level: int) -> F
             value = score[k, np.arange(len(k))]
             better = value > best[point]
             best[point[better]], angle[point[better]], ring[point[better]] = value[better], theta[k[better]], radius
-    row, col, angle, ring, best = (v[best > LEAST] for v in (row, col, angle, ring, best))
-    around = np.zeros([n + 2 * _APART for n in strong.shape], np.float32)
+    row, col = np.divmod(at[best > LEAST], scaled.shape[1])
+    angle, ring, best = (v[best > LEAST] for v in (angle, ring, best))
+    around = np.zeros([n + 2 * _APART for n in scaled.shape], np.float32)
     around[row + _APART, col + _APART] = best
     windows = np.lib.stride_tricks.sliding_window_view(around, (2 * _APART + 1,) * 2)
     peak = best == windows[row, col].max((1, 2), initial=0.0)

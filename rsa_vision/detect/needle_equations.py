@@ -161,8 +161,19 @@ def linearise(
     arms = len(members[0].angles)
     of_slants = OF_SLANTS[arms]
     expected = np.array([*[SLANT] * (of_slants.shape[1] - 1), SKEW])
+    lapped = lapping([b[0].sum(0) for b in blocks])
+    linear = np.concatenate([*(b[0] for b in blocks), *lapped, surface])
+    root = np.sqrt(weight)
+    if lapped:  # the product of two blurred shadows is not quite what the film shows of both
+        deepest = max(abs(f.depth) for f in members)
+        root = 1 / np.hypot(1 / root, _OF_PRODUCT * deepest * lapped[0][0])
+    seen = linear * root
+    theta = damped_solution(seen @ seen.T, seen @ (root * window.data), 1e-6)
+    model = theta @ linear
+    left = window.data - model
+    now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
     moves, common, priors, known = [], np.zeros((SHARED + (arms - 1) * parallel, len(weight))), [], []
-    for f, block, slope, differs in zip(members, blocks, slopes, spread, strict=True):
+    for f, block, slope, differs in zip(now, blocks, slopes, spread, strict=True):
         size = np.array([f.shape.half_width_px, f.shape.length_px])
         by_tip_and_size = f.depths @ block[1:5]
         turns = f.depths[:, None] * block[5]
@@ -181,21 +192,8 @@ def linearise(
             turning,
             -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected,
         ]
-    lapped = lapping([b[0].sum(0) for b in blocks])
-    linear = [*(b[0] for b in blocks), *lapped, surface]
-    root = np.sqrt(weight)
-    if lapped:  # the product of two blurred shadows is not quite what the film shows of both
-        deepest = max(abs(f.depth) for f in members)
-        root = 1 / np.hypot(1 / root, _OF_PRODUCT * deepest * lapped[0][0])
-    rows = np.concatenate([*moves, *linear, common]) * root
-    normal = rows @ rows.T
-    p, n_linear = len(rows) - len(common), sum(len(rows_) for rows_ in linear)
-    at = slice(p - n_linear, p)
-    theta = damped_solution(normal[at, at], rows[at] @ (root * window.data), 1e-6)
-    model = theta @ np.concatenate(linear)
-    left = window.data - model
-    now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
-    rest = np.zeros(n_linear)
+    rows = np.concatenate([*moves, linear, common]) * root
+    p, rest = len(rows) - len(common), np.zeros(len(linear))
     return Equations(
         members=now,
         images=[f.depths @ b[0] for f, b in zip(now, blocks, strict=True)],
@@ -206,7 +204,7 @@ def linearise(
         background=float(theta[-len(surface)]),
         own=rows[:p],
         common=rows[p:],
-        normal=normal,
+        normal=rows @ rows.T,
         residual=left * root,
         prior=np.concatenate([*priors, rest]),
         known=np.concatenate([*known, rest]),

@@ -159,16 +159,18 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
         if np.count_nonzero(whole) >= ENOUGH_TILES:
             break
-    tiles = (tiles[whole] if whole.any() else tiles).astype(np.float64)
+    tiles = tiles[whole] if whole.any() else tiles
     side = tiles.shape[1]
     axis = np.linspace(-1, 1, side)
     gx, gy = np.meshgrid(axis, axis)
     basis = np.linalg.qr(np.stack([b.ravel() for b in (np.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy)], axis=1))[0]
     flat = tiles.reshape(len(tiles), -1)
-    rest = flat - (flat @ basis) @ basis.T
-    dof = side * side - basis.shape[1]
-    variance = np.einsum("ij,ij->i", rest, rest) / dof
     mean = medians(flat)  # a mark in a tile must not make it a level of its own
+    rest = flat.astype(np.float32) - mean[:, None].astype(np.float32)  # single precision does once the level is off
+    single = basis.astype(np.float32)
+    rest -= (rest @ single) @ single.T
+    dof = side * side - basis.shape[1]
+    variance = np.einsum("ij,ij->i", rest, rest).astype(np.float64) / dof
     order = np.argsort(mean)
     level, curve, quiet = [], [], []
     for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
@@ -201,7 +203,7 @@ def medians(values: NDArray[Any]) -> NDArray[Any]:
     half = values.shape[-1] // 2
     parted = np.partition(values, half)
     upper = parted[..., half]
-    return np.asarray(upper if values.shape[-1] % 2 else (upper + parted[..., :half].max(-1)) / 2)
+    return np.asarray(upper if values.shape[-1] % 2 else upper / 2 + parted[..., :half].max(-1) / 2)
 
 
 def _smooth(level: Float, variance: Float) -> Float:
@@ -286,11 +288,11 @@ def influence_covariance(influence: NDArray[Any], correlation: Float) -> Float:
     ndarray of shape (..., p, p)
     """
     # by Parseval's theorem in the frequency domain, where the columns of the half spectrum but the first and the middle one stand for two
-    size = tuple(next_fast_len(n + len(correlation), real=True) for n in influence.shape[-2:])
+    size = tuple(next_fast_len(n + len(correlation) // 2, real=True) for n in influence.shape[-2:])
     # to six digits, in half the time of double precision
     spectrum = rfft2(influence.astype(np.float32), s=size).reshape(*influence.shape[:-2], -1)
-    weighted = spectrum * _power(correlation.tobytes(), len(correlation), size)
-    return np.asarray(np.matmul(weighted, spectrum.conj().swapaxes(-1, -2)).real, np.float64)
+    weighted = (spectrum * _root_of_power(correlation.tobytes(), len(correlation), size)).view(np.float32)  # real and imaginary parts
+    return np.asarray(np.matmul(weighted, weighted.swapaxes(-1, -2)), np.float64)
 
 
 def power_spectrum(correlation: Float, size: tuple[int, ...]) -> Float:
@@ -301,8 +303,8 @@ def power_spectrum(correlation: Float, size: tuple[int, ...]) -> Float:
 
 
 @lru_cache(maxsize=64)
-def _power(correlation: bytes, side: int, size: tuple[int, ...]) -> Float:
-    """Return the power of correlated noise at the frequencies of ``rfft2``, for sums over the half spectrum to be sums over pixels."""
+def _root_of_power(correlation: bytes, side: int, size: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return the root of the power of correlated noise at the frequencies of ``rfft2``, so that sums over half of them are whole."""
     power = np.maximum(power_spectrum(np.frombuffer(correlation).reshape(side, side), size), 0.0) / np.prod(size)
     power[:, 1 : (size[1] + 1) // 2] *= 2
-    return np.asarray(power.ravel(), np.float32)
+    return np.sqrt(power.ravel()).astype(np.float32)

@@ -23,7 +23,7 @@ from rsa_vision.types import Bool, Float
 SLIM = 4.5  # length over half the width; two balls side by side have four
 EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters leave more
 BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
-_MOST_STROKES = 60
+MOST_STROKES = 60  # strongest of a film
 _MOST_IN_VAIN = 20  # strokes in a row that are no pins
 _ROUGH, _STANDS_OUT_ROUGHLY = 0.85, 11.0  # explained by a first look, with guessed optics; its significance
 _SIGNIFICANT = 9.0
@@ -48,7 +48,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
     ----------
     film : ndarray of shape (rows, cols)
     strokes : ndarray of shape (n, 6)
-        As of :func:`rsa_vision.detect.strokes.find_strokes`.
+        As of :func:`rsa_vision.detect.strokes.find_strokes`, strongest first.
     noise : NoiseModel
 
     Returns
@@ -60,7 +60,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
     tried = np.zeros((0, 2))
     in_vain = 0
     guess = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
-    for col, row, angle, length, width, _ in strokes[np.argsort(-np.abs(strokes[:, 5]))][:_MOST_STROKES]:
+    for col, row, angle, length, width, _ in strokes:
         if (np.hypot(*(tried - [col, row]).T) < _AGAIN * length).any():
             continue  # the same stroke, seen by another filter
         tried = np.append(tried, [[col, row]], axis=0)
@@ -90,7 +90,7 @@ def find_pins(
     ----------
     film : ndarray of shape (rows, cols)
     rough : list of NeedleFit
-        As of :func:`look_for_pins`, one polarity.
+        As of :func:`look_for_pins`, one polarity, perhaps of several looks.
     tees : list of NeedleFit
         Their arms are no single pins.
     optics : Optics
@@ -102,9 +102,8 @@ def find_pins(
     optics : Optics
         With the attenuation that suits the pins.
     """
-    middle = np.array([_middle(f) for f in rough]).reshape(-1, 2)
-    on_tees = np.any([np.zeros(len(rough), bool), *(_on_arm(middle, tee) for tee in tees)], axis=0)
-    rough = [f for f, on in zip(rough, on_tees, strict=True) if not on]
+    on_tees = on_arms(np.array([_middle(f) for f in rough]).reshape(-1, 2), tees)
+    rough = _distinct([f for f, on in zip(rough, on_tees, strict=True) if not on])
     if not rough:
         return [], optics
     taper, sample = _best_taper(film, rough[:_SAMPLE], optics, noise)
@@ -280,6 +279,11 @@ def _middle(fit: NeedleFit) -> Float:
     half, angle = 0.5 * fit.shape.length_px, float(fit.angles[0])
     middle: Float = fit.position_px + half * np.array([math.cos(angle), -math.sin(angle)])
     return middle
+
+
+def on_arms(places: Float, needles: list[NeedleFit]) -> Bool:
+    """Say which places (n, 2) lie on an arm of a needle."""
+    return np.asarray(np.any([np.zeros(len(places), bool), *(_on_arm(places, needle) for needle in needles)], axis=0))
 
 
 def _on_arm(places: Float, needle: NeedleFit) -> Bool:

@@ -26,7 +26,9 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
 _STEPS = 8
-_CONVERGED = 0.15  # root mean square over the tips, in standard deviations: by that little a few go to and fro for ever
+# root mean square over the tips of pins and of tees, in standard deviations: by the former a few go to and fro for ever; three arms hold a
+# tip, so that after the latter the next step is a quarter of that
+_CONVERGED = {1: 0.15, 3: 0.25}
 _FINEST_PX = 0.02  # added to those, for the tables are interpolated
 _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
 _TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
@@ -101,15 +103,15 @@ def fit_shared(
         change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
         if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
             change[:OPTICS] = 0.0  # new tables for so little are not worth their time
+        moves = [e.step(change) for e in systems]
+        surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, moves, strict=True)])
+        converged = step > 0 and float(surprise.mean()) < _CONVERGED[len(needles[0].angles)] ** 2
+        if converged and not alike:
+            break  # from so near the last step gets there as well; that to the sizes of all is longer
         moved += change
         taper += change[2]
-        optics = replace(start, mu_px=start.mu_px * float(np.exp(moved[0])), sigma_px=start.sigma_px * float(np.exp(moved[1])))
-        surprise = []
-        for i, e in enumerate(systems):
-            own = e.step(change)
-            sets[i] = _moved(e.members, own, change, taper, parallel)
-            surprise.append(e.surprise(own, _FINEST_PX))
-        converged = step > 0 and float(np.concatenate(surprise).mean()) < _CONVERGED**2
+        optics = _moved_optics(start, moved)
+        sets = [_moved(e.members, own, change, taper, parallel) for e, own in zip(systems, moves, strict=True)]
         sizes = replace(sizes, typical=sizes.typical + change[OPTICS:SHARED])
         if alike and step + 1 == _SIZES_AFTER:
             sizes, converged = _sizes(systems, sets), False
@@ -118,14 +120,16 @@ def fit_shared(
     normal = precision + sum(matrix for matrix, _ in told)
     change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
     moves = [e.step(change) for e in systems]
+    taper, optics = taper + change[2], _moved_optics(start, moved + change)
+    sets = [_moved(e.members, own, change, taper, parallel) for e, own in zip(systems, moves, strict=True)]
     left = np.array([e.noise_under(own, change) for e, own in zip(systems, moves, strict=True)])
     # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
     under = at_rims(min(usual_square(left), 1.0)) if len(needles) >= LEAST else 1.0
     by_noise = [_by_noise(window, e, noise) for window, e in zip(windows, systems, strict=True)]
     errors = _common_errors(systems, by_noise, normal, precision, under)
     out = []
-    for window, e, own, scatter in zip(windows, systems, moves, by_noise, strict=True):
-        out += _finished(window, e, own[e.tips].reshape(-1, 2), under * scatter, errors, noise, converged)
+    for window, e, members, scatter in zip(windows, systems, sets, by_noise, strict=True):
+        out += _finished(window, e, members, under * scatter, errors, noise, converged)
     return out, optics
 
 
@@ -158,6 +162,11 @@ def _sizes(systems: list[Equations], sets: list[list[NeedleFit]]) -> _Sizes:
     told = [true_spread(values[:, k], variance[:, k]) for k in range(2)]
     spread = np.stack([np.where(belongs, sd, np.inf) for _, sd, belongs in told], axis=1)
     return _Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
+
+
+def _moved_optics(start: Optics, by: Float) -> Optics:
+    """Optics with these changes of the logarithms of attenuation and blur."""
+    return replace(start, mu_px=start.mu_px * float(np.exp(by[0])), sigma_px=start.sigma_px * float(np.exp(by[1])))
 
 
 def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> list[NeedleFit]:
@@ -199,7 +208,7 @@ def _common_errors(systems: list[Equations], by_noise: list[Float], normal: Floa
 
 
 def _finished(
-    window: Window, e: Equations, move: Float, by_noise: Float, errors: Float, noise: NoiseModel, converged: bool
+    window: Window, e: Equations, members: list[NeedleFit], by_noise: Float, errors: Float, noise: NoiseModel, converged: bool
 ) -> list[NeedleFit]:
     by_common, tips = e.own_by_common[e.tips], slice(len(e.tips))
     covariance = by_noise[tips, tips] + by_common @ errors @ by_common.T
@@ -207,8 +216,8 @@ def _finished(
     covariance = covariance + of_prior @ of_prior.T
     variance = float(noise.variance_at(np.array([e.background]))[0])
     out = []
-    for i, (fit, image) in enumerate(zip(e.members, e.images, strict=True)):
+    for i, (fit, image) in enumerate(zip(members, e.images, strict=True)):
         at = slice(2 * i, 2 * i + 2)
-        fit = replace(fit, position_px=fit.position_px + move[i], covariance_px2=covariance[at, at], converged=converged)
+        fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
         out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance))
     return out

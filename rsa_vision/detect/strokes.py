@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from rsa_vision.types import Float, Int
+from rsa_vision.types import Bool, Float, Int
 
 LEAST_PEAK = 2.0  # of an island, in units of what counts as significant
 SLIM = 1.5  # ratio of an island's length to its width
 LENGTHS_PX = (4.0, 130.0)  # film pixels; needles and wires are longer
 COLUMNS = 6
+_ALONG, _ASIDE_PX = (0.3, 1.6), 4.0  # of its length, from its middle; or by its width: where the tip of an arm is
 _LEAST_AREA = 4  # pixels of the answer
 
 
@@ -50,6 +51,26 @@ def find_strokes(answer: NDArray[Any], place: Int, strength: Float, level: int) 
             for sign, mine in ((1, dark), (-1, ~dark))
         ]
     )
+
+
+def at_junctions(strokes: Float, junctions: Float) -> Bool:
+    """Say which strokes end at a junction of the same polarity: they are arms of tees, most likely, and no single pins.
+
+    Parameters
+    ----------
+    strokes : ndarray of shape (n, 6)
+    junctions : ndarray of shape (m, 5)
+        As of :func:`rsa_vision.detect.junctions.find_junctions`.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    col, row, angle, length, width, strength = strokes.T[:, :, None]
+    dx, dy, c, s = junctions[:, 0] - col, junctions[:, 1] - row, np.cos(angle), -np.sin(angle)
+    along, across = np.abs(dx * c + dy * s) / length, np.abs(dy * c - dx * s)
+    on = (along > _ALONG[0]) & (along < _ALONG[1]) & (across < np.maximum(width, _ASIDE_PX))
+    return np.asarray((on & (np.sign(junctions[:, 4]) == np.sign(strength))).any(axis=1))
 
 
 def _one_polarity(r: Int, c: Int, weight: Float, over: Float, level: int, sign: int) -> Float:

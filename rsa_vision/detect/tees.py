@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.crossing import fit_crossing
+from rsa_vision.detect.crossing import fit_crossing, moved
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.junctions import RINGS_PX
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
@@ -161,14 +161,15 @@ def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: No
     """Starts at every place that looks like one of the models."""
     found = [find_like(film, template_of(m, optics)) for m in models]
     # what brighter tees hide here is found once these are known
-    found = [places[promising(film, places, m, optics, noise)] for m, places in zip(models, found, strict=True)]
-    model = np.repeat(np.arange(len(models)), [len(f) for f in found])
-    places = np.concatenate(found)
+    looks = [promising(film, places, m, optics, noise) for m, places in zip(models, found, strict=True)]
+    worth, step = (np.concatenate(of) for of in zip(*looks, strict=True))
+    model, places = np.repeat(np.arange(len(models)), [len(f) for f in found]), np.concatenate(found)
     starts: list[NeedleFit] = []
-    free = np.ones(len(places), bool)
+    free = worth
     for i in np.argsort(-places[:, 2], kind="stable"):
         if free[i]:
-            starts.append(replace(models[model[i]], position_px=places[i, :2]))
+            start = replace(models[model[i]], position_px=places[i, :2])
+            starts += moved([start], step[[i]], int(start.shape.length_px) * 2)
             free &= np.hypot(*(places[:, :2] - places[i, :2]).T) > _NEAREST_PX
     return _peeled(film, starts, optics, noise)
 
