@@ -14,11 +14,11 @@ class MarkerFlag(IntFlag):
     """What to know of one marker image or one reconstructed marker."""
 
     NONE = 0
-    OVERLAP = 1  # fitted jointly with a neighbour that it overlaps
+    OVERLAP = 1  # fitted jointly with a neighbour that it overlaps, or as dense a thing beside it
     EDGE = 2  # its image reaches over the edge of the film
     SATURATED = 4  # saturated pixels under it were masked
     CLIPPED = 8  # so much was masked that the coordinates lean on little
-    POOR_FIT = 16  # the model does not describe the film here within its noise
+    POOR_FIT = 16  # the model does not describe the film here within its noise, or leaves the place open
     REJECTED = 32  # left out by a gross-error rule
     LARGE_RESIDUAL = 64  # residual beyond its statistics
     AMBIGUOUS = 128  # another identity explains it nearly as well

@@ -181,12 +181,12 @@ def lonely_images(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[
     paired[[bundle.image[ray] for group in pairing.groups for ray in group]] = True
     with np.errstate(invalid="ignore", divide="ignore"):
         look = np.log(np.column_stack([table.radius_px, table.contrast]))
-    doubtful = (table.points.flags & LOOKS_DOUBTFUL) != 0
+    quality = image_quality(table.points.flags)
     found: list[Finding] = []
     for number, film in enumerate(table.films):
         here = np.flatnonzero(paired & (table.points.film == number))
         here = np.concatenate([here, pairing.unmatched[table.points.film[pairing.unmatched] == number]])
-        chance = chance_of_marker(look[here], table.points.position_px[here], doubtful[here], paired[here], film.shape)
+        chance = chance_of_marker(look[here], table.points.position_px[here], quality[here], paired[here], film.shape)
         found += [("marker-one-view", _where(table, int(row))) for row in here[(chance > MAY_BE_MARKER) & ~paired[here]]]
     return found
 

@@ -54,6 +54,7 @@ CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the p
 EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 BENT = 1.5  # the same once an edge or bending surfaces around it could have taken it up
+_LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
@@ -257,7 +258,9 @@ def _one_polarity(
     left, poor = _what_is_left(balls, under, noise)
     poor |= covered
     keep = left < BENT * MISFIT
-    keep[poor] &= ~goes_on(film, balls.rows(poor), np.flatnonzero(poor), beside, optics.sigma_px)
+    ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
+    keep &= ~(poor & ends)
+    touching |= ends  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
     images, evidence = _table(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
@@ -351,6 +354,8 @@ def _table(
     most = 0.25 * (balls.radius_px + optics.sigma_px) ** 2
     covariance[:n] *= np.minimum(1.0, most / np.linalg.eigvalsh(covariance[:n])[:, -1])[:, None, None]
     covariance[:n] += EXACT_PX**2 * np.eye(2) + doubt_of_number(balls)
+    lost = np.linalg.eigvalsh(covariance[:n])[:, -1] > (_LOST * balls.radius_px) ** 2
+    flags[:n][lost] |= MarkerFlag.POOR_FIT
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))

@@ -20,7 +20,7 @@ BITS = 16  # of a film of log odds
 _CLEAR = 1.1  # of full scale: the light where nothing is in its way; nearer to the end of the scale noise would grow without limit
 _HIGH = 0.25  # of its background, the depth of the typical ball: of a lower one the log odds are as straight as the value
 _OVER_NOISE = 10.0  # height of the typical ball in logarithms, over the noise of a pixel: of less, what is bent does not show
-_ASKED = 20  # balls, of all heights, that tell which scale is theirs
+_ASKED = 40  # balls, of all heights, that tell which scale is theirs
 _SIZES = (1.0, 1.6)  # in log odds, where one of them is in values
 _STRAIGHTER = 1.05  # times less that log odds leave of a ball's variance
 

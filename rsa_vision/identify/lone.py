@@ -12,14 +12,16 @@ from scipy.special import expit, gammaln
 
 from rsa_vision.identify.densities import log_kernels, log_student
 from rsa_vision.identify.looks import KIND, UNSURE, WIDE
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
+OF_MARKERS: Final = (0.94, 0.05, 0.01)  # images of markers that are clear, disturbed by something beside them, described badly
+PRESUMED_IMAGES: Final = 2.0  # images that such a presumption is worth; of clutter, one is as frequent as the other
 PRESUMED: Final = (0.5, 0.05)  # markers that one focus does not show: that many, and that part of those both show
 FREEDOM: Final = 4.0  # of the places of markers on a film: another bone may lie apart
 LEAST_SPREAD: Final = 0.05  # of the places, as a part of the film's larger side
 
 
-def chance_of_marker(look: Float, place_px: Float, doubtful: Bool, paired: Bool, shape: tuple[int, int]) -> Float:
+def chance_of_marker(look: Float, place_px: Float, quality: Int, paired: Bool, shape: tuple[int, int]) -> Float:
     """Return how probable the images of one film are to be markers, by those that have a partner.
 
     Parameters
@@ -28,8 +30,8 @@ def chance_of_marker(look: Float, place_px: Float, doubtful: Bool, paired: Bool,
         Logarithms of radius and contrast.
     place_px : ndarray of shape (n, 2)
         (col, row).
-    doubtful : ndarray of bool, shape (n,)
-        Whether the look of an image says little.
+    quality : ndarray of int, shape (n,)
+        0 clear, 1 disturbed by something beside it, 2 not described well; the look of the latter two says little.
     paired : ndarray of bool, shape (n,)
         Whether it has a partner.
     shape : tuple of two ints
@@ -45,14 +47,14 @@ def chance_of_marker(look: Float, place_px: Float, doubtful: Bool, paired: Bool,
     if not len(lone) or not len(teachers):
         return result
     log_place = _log_density_of_places(place_px[lone], place_px[teachers], max(shape)) + np.log(shape[0] * shape[1])
-    part = (doubtful[teachers].sum() + 0.5) / (len(teachers) + 1)  # of markers; of clutter one half
-    odds = np.log(np.where(doubtful[lone], part, 1 - part) / 0.5) + log_place
+    seen = np.bincount(quality[teachers], minlength=len(OF_MARKERS)) + PRESUMED_IMAGES * np.array(OF_MARKERS)
+    odds = np.log(len(seen) * (seen / seen.sum())[quality[lone]]) + log_place
     odds += np.log((PRESUMED[0] + PRESUMED[1] * len(teachers)) / len(lone))
-    clear = teachers[~doubtful[teachers]]
+    clear = teachers[quality[teachers] == 0]
     if len(clear):
         middle = np.median(look[clear], axis=0)
         for k, row in enumerate(lone):
-            width = np.hypot(KIND, UNSURE if doubtful[row] else 0.0)
+            width = np.hypot(KIND, UNSURE if quality[row] else 0.0)
             marker = log_kernels(look[row], look[clear], np.ones(len(clear)), width, len(clear))
             anything = log_student((look[row] - middle) / WIDE, 3.0) - np.log(WIDE)
             odds[k] += marker - float(anything.sum())
