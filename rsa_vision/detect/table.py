@@ -1,0 +1,117 @@
+"""What was found on a film as one table, in film order, with flags and with all that is known of the errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.decide import EDGE
+from rsa_vision.detect.find import CHANCE, DOUBTFUL, MISFIT, misfit
+from rsa_vision.detect.needle_images import NeedleFit
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.resolve import doubt_of_number
+from rsa_vision.detect.settle import STRUCTURE
+from rsa_vision.flags import MarkerFlag
+from rsa_vision.types import Bool, Float, MarkerImages
+
+EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
+WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
+_LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
+_SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
+_OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
+_CAP = 50.0  # significance beyond which a needle is no better evidence
+
+
+def what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Float, Bool]:
+    """Return the misfit of each ball, and which are not described well."""
+    under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
+    left = misfit(under, noise, CHANCE)
+    return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE)
+
+
+def table_of(
+    film: NDArray[Any],
+    bits: int,
+    balls: BallFits,
+    usual: float,
+    ratio: Float,
+    touching: Bool,
+    poor_ball: Bool,
+    tees: list[NeedleFit],
+    optics: Optics,
+    noise: NoiseModel,
+) -> tuple[MarkerImages, float]:
+    """Put balls and tees into one table, row by row of the film, with flags.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    bits : int
+    balls : BallFits
+    usual : float
+        Variance of the noise under balls, in units of that beside them.
+    ratio : ndarray of shape (n,)
+        Squared errors by their surroundings, as :func:`rsa_vision.detect.settle.settle` tells.
+    touching, poor_ball : ndarray of bool, shape (n,)
+        Balls with something as dense beside them; balls that the model does not describe.
+    tees : list of NeedleFit
+        And pins.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    images : MarkerImages
+    evidence : float
+        For marks of this polarity.
+    """
+    full = float(2**bits - 1)
+    n, m = len(balls.depth), len(tees)
+    position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
+    # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
+    left = balls.chi2_uneven / usual
+    excess = np.where(left > 1 + CHANCE * noise.scatter(balls.n_core), left, 1.0)
+    # structure around a ball that its background does not hold goes on under it
+    excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0)) * ratio
+    covariance = np.concatenate(
+        [
+            balls.covariance[:, :2, :2] * excess[:, None, None],
+            np.array([t.covariance_px2 * _excess(t, noise) for t in tees]).reshape(-1, 2, 2),
+        ]
+    )
+    radius = np.concatenate([balls.radius_px, [t.shape.half_width_px for t in tees]])
+    depth = np.abs(np.concatenate([balls.depth, [t.depth for t in tees]]))
+    background = np.concatenate([balls.background, [t.background for t in tees]])
+    flags = np.zeros(n + m, np.int64)
+    reach = np.concatenate([balls.radius_px + 1, [t.shape.length_px for t in tees]])
+    edge = (position < reach[:, None]).any(1) | (position[:, 0] > film.shape[1] - 1 - reach) | (position[:, 1] > film.shape[0] - 1 - reach)
+    flags[edge] |= MarkerFlag.EDGE
+    valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in tees]])
+    flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
+    flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
+    flags[:n][touching] |= MarkerFlag.OVERLAP
+    poor = np.concatenate([poor_ball, np.array([t.misfit for t in tees]) > DOUBTFUL * MISFIT])
+    flags[poor] |= MarkerFlag.POOR_FIT
+    # what the model does not describe may be two marks in one: its centre is only somewhere in it
+    covariance[poor] += (_SOMEWHERE * radius[poor] ** 2)[:, None, None] * np.eye(2)
+    # whatever lies around it, what was found of a ball lies under its image: evenly spread over a disc at worst
+    most = 0.25 * (balls.radius_px + optics.sigma_px) ** 2
+    covariance[:n] *= np.minimum(1.0, most / np.linalg.eigvalsh(covariance[:n])[:, -1])[:, None, None]
+    covariance[:n] += EXACT_PX**2 * np.eye(2) + doubt_of_number(balls)
+    lost = np.linalg.eigvalsh(covariance[:n])[:, -1] > (_LOST * balls.radius_px) ** 2
+    flags[:n][lost] |= MarkerFlag.POOR_FIT
+    angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
+    shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
+    snr = depth / np.sqrt(noise.variance_at(background))
+    table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
+    trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(snr, _CAP))
+
+
+def _excess(fit: NeedleFit, noise: NoiseModel) -> float:
+    return fit.chi2_core if fit.chi2_core > 1 + CHANCE * noise.scatter(np.array(fit.n_core)) else 1.0
