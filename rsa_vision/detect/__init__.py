@@ -26,7 +26,7 @@ from rsa_vision.detect.pins import MOST_STROKES, find_pins, look_for_pins, on_ar
 from rsa_vision.detect.polarity import first_looks, off_pins, polarities
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
-from rsa_vision.detect.response import BITS, in_film_values, is_straighter, log_odds, scale_matters
+from rsa_vision.detect.response import BITS, high_balls, in_film_values, is_straighter, log_odds
 from rsa_vision.detect.rims import goes_on
 from rsa_vision.detect.second_look import look_again
 from rsa_vision.detect.settle import STRUCTURE, settle
@@ -96,9 +96,10 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
     seeds, signs = first_looks(values, candidates, pins, noise)
     found = []
     for sign, optics, mine, of_marks in polarities(values, signs, seeds, pins, candidates, noise):
-        if sign > 0 and not as_it_is and scale_matters(mine, of_marks):
+        bright = high_balls(mine, of_marks)
+        if len(bright.depth) and not as_it_is:
             other, its_noise = log_odds(values, bits, noise)
-            if is_straighter(values, noise, other, its_noise, mine, optics):
+            if is_straighter(values, noise, other, its_noise, bright, optics):
                 detection = _detect(other, BITS, its_noise, limit, as_it_is=True)
                 return replace(detection, images=in_film_values(detection.images, bits))
         found.append(_one_polarity(values, bits, sign, optics, mine, pins, candidates, faint, of_marks, limit))

@@ -45,14 +45,14 @@ _SPECKS = 0.5  # of the capped significance of the best
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
 _MUCH_MORE = 1.5  # times the variance
-_CAP = 50.0  # significance beyond which a ball is no better evidence
+CAP = 50.0  # significance beyond which a mark is no better evidence
 
 
 def ball_evidence(fits: BallFits, noise: NoiseModel) -> float:
     """Return how much the fits speak for balls: significances, weighted by how closely the model describes each."""
     rest = np.maximum(misfit(fits, noise) / MISFIT, (1 - fits.explained) / (1 - EXPLAINED))
     whole = (fits.valid_fraction > 0.95) & (fits.window_fraction > 0.8)
-    return float((np.minimum(fits.significance, _CAP) * np.exp(-((rest / _SHARP) ** 2)))[whole].sum())
+    return float((np.minimum(fits.significance, CAP) * np.exp(-((rest / _SHARP) ** 2)))[whole].sum())
 
 
 def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> tuple[Optics, float]:
@@ -74,7 +74,7 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     if len(seeds.depth) == 0:
         return Optics(COARSE_SIGMA_PX, COARSE_MU_PX), 0.0
     # those that are whole tell most; not where they are specks beside balls of which noise or saturation takes a part
-    strength, inside = np.minimum(seeds.significance, _CAP), seeds.window_fraction > _INSIDE
+    strength, inside = np.minimum(seeds.significance, CAP), seeds.window_fraction > _INSIDE
     clear, partly = (inside & (seeds.valid_fraction > least) for least in (_WHOLE, _PARTLY))
     if partly.any():
         seeds = seeds.rows(clear if strength[clear].max(initial=0.0) > _SPECKS * strength[partly].max() else partly)
@@ -90,7 +90,7 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     closest = np.min([_closeness(t, noise, noisy) for t in trials], axis=0)
     chosen = np.argsort(closest)[:_MOST_SEEDS]
     chosen = chosen[closest[chosen] < max(0.08, 1.5 * closest[chosen[0]])]
-    known = np.minimum(in_correlated_noise(seeds.rows(best), COARSE_SIGMA_PX, noise), _CAP) / _CAP
+    known = np.minimum(in_correlated_noise(seeds.rows(best), COARSE_SIGMA_PX, noise), CAP) / CAP
     say = known**2 if noisy else np.ones(len(best))  # specks say little of the blur
 
     def likeliest(these: Int) -> float:

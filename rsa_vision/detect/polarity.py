@@ -13,7 +13,7 @@ from rsa_vision.detect.find import ROUNDNESS, STRENGTH, distinct, first_look
 from rsa_vision.detect.leftover import noise_at_marks
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
-from rsa_vision.detect.optics import ball_evidence, estimate_optics
+from rsa_vision.detect.optics import CAP, ball_evidence, estimate_optics
 from rsa_vision.detect.pins import is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.tees import optics_of_tees
@@ -25,7 +25,6 @@ _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less t
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
-_CAP = 50.0  # significance beyond which a needle is no better evidence
 
 
 def first_looks(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> tuple[BallFits, list[int]]:
@@ -57,7 +56,7 @@ def first_looks(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit
     evidence = {this: ball_evidence(distinct(fits, noise), noise) for this, fits in looks.items()}
     best = max(evidence, key=lambda this: evidence[this])
     needles = {
-        this: sum(min(p.significance, _CAP) for p in pins if np.sign(p.depth) == this)
+        this: sum(min(p.significance, CAP) for p in pins if np.sign(p.depth) == this)
         + _of_tees(candidates, this)
         + _of_arms(candidates.strokes, this)
         for this in looks
@@ -86,7 +85,7 @@ def _of_tees(candidates: Candidates, sign: int) -> float:
 def _of_arms(strokes: Float, sign: int) -> float:
     """The same of strokes at junctions."""
     strength = -sign * STRENGTH * strokes[:, 5]
-    return float(np.clip(strength, 0.0, _CAP).sum())
+    return float(np.clip(strength, 0.0, CAP).sum())
 
 
 def polarities(

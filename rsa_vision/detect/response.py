@@ -79,18 +79,18 @@ class _LogOdds:
         return np.asarray((_CLEAR * self.full * odds - 1) / (1 + odds))
 
 
-def scale_matters(looks: BallFits, noise: NoiseModel) -> bool:
-    """Say whether clear balls are so much brighter than what is around them that log odds differ from values in more than a factor."""
+def high_balls(looks: BallFits, noise: NoiseModel) -> BallFits:
+    """Return clear balls of all heights; none where they are not so bright that log odds differ from values in more than a factor."""
     clear = looks.rows(look_clear(looks, noise) & (looks.depth > 0) & (looks.background > 0))
-    if len(clear.depth) < LEAST_KNOWN:
-        return False
     high = clear.depth / clear.background
     over_noise = np.log1p(high) * clear.background / np.sqrt(noise.variance_at(clear.background))
-    return bool(np.median(high) > _HIGH and np.median(over_noise) > _OVER_NOISE)
+    if len(high) < LEAST_KNOWN or np.median(high) <= _HIGH or np.median(over_noise) <= _OVER_NOISE:
+        return clear.rows(slice(0))
+    return clear.rows(np.argsort(high)[:: 1 + len(high) // _ASKED])
 
 
 def is_straighter(
-    film: NDArray[Any], noise: NoiseModel, other: NDArray[Any], other_noise: NoiseModel, looks: BallFits, optics: Optics
+    film: NDArray[Any], noise: NoiseModel, other: NDArray[Any], other_noise: NoiseModel, balls: BallFits, optics: Optics
 ) -> bool:
     """Say whether the balls of a film are described better in another scale of its values.
 
@@ -101,24 +101,22 @@ def is_straighter(
     other : ndarray of shape (rows, cols)
         The same film in the other scale.
     other_noise : NoiseModel
-    looks : BallFits
-        First looks at ``film``.
+    balls : BallFits
+        First looks at clear ones on ``film``.
     optics : Optics
         Of ``film``.
 
     Returns
     -------
     bool
-        Clear balls leave less of their variance there.
+        They leave less of their variance there.
     """
-    clear = looks.rows(look_clear(looks, noise))
-    clear = clear.rows(np.argsort(clear.depth / np.maximum(clear.background, 1.0))[:: 1 + len(clear.depth) // _ASKED])
-    here = fit_at(film, clear.position_px, clear.radius_px, optics, noise)
+    here = fit_at(film, balls.position_px, balls.radius_px, optics, noise)
     # the brighter a ball against what is around it, the less of it shows in values
-    seeds = [fit_at(other, clear.position_px, size * clear.radius_px, optics, other_noise) for size in _SIZES]
+    seeds = [fit_at(other, balls.position_px, size * balls.radius_px, optics, other_noise) for size in _SIZES]
     closest = min(seeds, key=lambda fits: float(np.median(1 - fits.explained)))
     its_optics, _ = estimate_optics(other, closest, other_noise)
-    there = fit_at(other, clear.position_px, closest.radius_px, its_optics, other_noise)
+    there = fit_at(other, balls.position_px, closest.radius_px, its_optics, other_noise)
     return bool(np.median((1 - here.explained) / np.maximum(1 - there.explained, 1e-9)) > _STRAIGHTER)
 
 

@@ -13,6 +13,7 @@ from rsa_vision.detect.decide import EDGE
 from rsa_vision.detect.find import CHANCE, DOUBTFUL, MISFIT, misfit
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.optics import CAP
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import doubt_of_number
 from rsa_vision.detect.settle import STRUCTURE
@@ -24,7 +25,6 @@ WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
-_CAP = 50.0  # significance beyond which a needle is no better evidence
 
 
 def what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Float, Bool]:
@@ -110,7 +110,7 @@ def table_of(
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
     trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
-    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(snr, _CAP))
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(snr, CAP))
 
 
 def _excess(fit: NeedleFit, noise: NoiseModel) -> float:
