@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.optimize import brentq
 
@@ -13,13 +11,14 @@ _LEAST = 5  # from so many on their scatter tells something
 _OUTLIER = 3.0  # standard deviations
 SD_OF_MAD = 1.4826  # standard deviation of what is normal in units of its median deviation
 _MEDIAN_CHI2 = 0.455  # of one degree of freedom
+_STEPS = (np.arange(200) + 0.5) / 200  # spreads over themselves and the scatter
 
 
 def true_spread(values: Float, variances: Float) -> tuple[float, float, Bool]:
     """Tell how much quantities differ beyond the errors of their measurement (a random-effects model).
 
-    The spread is that for which the squared deviations are what they should be (Paule & Mandel, J. Res. NBS 87, 1982), plus one standard
-    deviation of what chance makes of it: few marks cannot prove that all are alike. Outliers are told by a first, robust spread.
+    The variance of the true values is the mean of its marginal likelihood, as if all variances were as likely before (Gelman, Bayesian
+    Analysis 1, 2006): few marks cannot prove that all are alike. Outliers are told by a first, robust spread.
 
     Parameters
     ----------
@@ -37,22 +36,25 @@ def true_spread(values: Float, variances: Float) -> tuple[float, float, Bool]:
     if len(values) < _LEAST:
         return float(np.mean(values)) if len(values) else 0.0, np.inf, everything
     middle = float(np.median(values))
-    rough = _solve(lambda s2: float(np.median((values - middle) ** 2 / (variances + s2))) - _MEDIAN_CHI2, values)
-    belongs = (values - middle) ** 2 < _OUTLIER**2 * (variances + rough)
+    belongs = (values - middle) ** 2 < _OUTLIER**2 * (variances + _robust_variance(values - middle, variances))
     x, v = values[belongs], variances[belongs]
     if len(x) < _LEAST:
         return middle, np.inf, everything
+    # spreads from none to endless, close to each other where they are like the scatter of the values or less
+    spread = _STEPS / (1 - _STEPS) * np.sqrt(x.var() + np.median(v))
+    weight = 1 / (v + spread[:, None] ** 2)
+    centre = (weight @ x) / weight.sum(1)
+    squares = (weight * (x - centre[:, None]) ** 2).sum(1)
+    log_likelihood = 0.5 * (np.log(weight).sum(1) - np.log(weight.sum(1)) - squares)
+    likelihood = np.exp(log_likelihood - log_likelihood.max()) * _STEPS / (1 - _STEPS) ** 3  # times the variance from step to step
+    return float(np.average(centre, weights=likelihood)), float(np.sqrt(np.average(spread**2, weights=likelihood))), belongs
+
+
+def _robust_variance(offsets: Float, variances: Float) -> float:
+    """Return the variance, beyond these, of which the median square is what it should be."""
 
     def excess(s2: float) -> float:
-        weight = 1 / (v + s2)
-        return float((weight * (x - np.average(x, weights=weight)) ** 2).sum()) - (len(x) - 1)
+        return float(np.median(offsets**2 / (variances + s2))) - _MEDIAN_CHI2
 
-    s2 = _solve(excess, x)
-    weight = 1 / (v + s2)
-    s2 += float(np.sqrt(2 / (len(x) - 1)) / weight.mean())
-    return float(np.average(x, weights=weight)), float(np.sqrt(s2)), belongs
-
-
-def _solve(excess: Callable[[float], float], values: Float) -> float:
-    most = float(np.ptp(values)) ** 2 * len(values) + 1e-12
+    most = float(np.ptp(offsets)) ** 2 * len(offsets) + 1e-12
     return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, most, xtol=1e-12, rtol=1e-3))

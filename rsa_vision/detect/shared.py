@@ -36,7 +36,7 @@ _SIZE_ERROR = 1.0  # of those, before
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
-_MUCH = 0.15  # of the logarithms, from which derivatives by them are taken anew
+_MUCH = np.array([0.15, 0.15, 0.02])  # of attenuation, blur, taper: changes from which derivatives by them are taken anew
 _MOST_BY_STEP = 0.6  # of all these
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
@@ -89,7 +89,7 @@ def fit_shared(
     last: list[Equations | None] = [None] * len(sets)
     converged = False
     for step in range(steps + 1):
-        if np.abs(moved[:OPTICS] - since).max() > _MUCH:
+        if (np.abs(moved[:OPTICS] - since) > _MUCH).any():
             slopes, since = [by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:OPTICS].copy()
         systems = [
             linearise(w, m, k, optics, noise, parallel, sizes.typical, spread, before)
@@ -103,9 +103,10 @@ def fit_shared(
         change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
         if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
             change[:OPTICS] = 0.0  # new tables for so little are not worth their time
+        far = float(change @ normal @ change) / len(change)
         moves = [e.step(change) for e in systems]
         surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, moves, strict=True)])
-        converged = step > 0 and float(surprise.mean()) < _CONVERGED[len(needles[0].angles)] ** 2
+        converged = step > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
         if converged and not alike:
             break  # from so near the last step gets there as well; that to the sizes of all is longer
         moved += change

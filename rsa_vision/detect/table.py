@@ -95,7 +95,7 @@ def table_of(
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
-    poor = np.concatenate([poor_ball, np.array([t.misfit for t in tees]) > DOUBTFUL * MISFIT])
+    poor = np.concatenate([poor_ball, np.array([_significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it
     covariance[poor] += (_SOMEWHERE * radius[poor] ** 2)[:, None, None] * np.eye(2)
@@ -114,4 +114,9 @@ def table_of(
 
 
 def _excess(fit: NeedleFit, noise: NoiseModel) -> float:
+    """Chi2 under a needle where it is more than chance makes it."""
     return fit.chi2_core if fit.chi2_core > 1 + CHANCE * noise.scatter(np.array(fit.n_core)) else 1.0
+
+
+def _significant_misfit(fit: NeedleFit, noise: NoiseModel) -> float:
+    return fit.misfit if _excess(fit, noise) > 1.0 else 0.0

@@ -9,7 +9,7 @@ TRIALS = 400
 
 
 @pytest.mark.parametrize("n", [8, 20, 40])
-@pytest.mark.parametrize("truth", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("truth", [0.0, 0.5, 1.0, 2.0])
 def test_what_is_held_near_to_the_others_has_an_honest_error(n: int, truth: float) -> None:
     rng = np.random.default_rng(n)
     square = []
