@@ -20,6 +20,7 @@ def film_of_pins(
     bright: bool = False,
     slope: float = 0.0,
     smaller: float = 1.0,
+    quanta: float = QUANTA,
 ) -> tuple[np.ndarray, Float, Float]:
     """Sixteen pins of 0.5 x 2 mm in all directions, exact chords; tips and directions away from them, both (n, 2), (col, row).
 
@@ -43,7 +44,7 @@ def film_of_pins(
         clear[corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= left
         tips.append(tip)
         ways.append(way)
-    counts = rng.poisson(base * gaussian_filter(clear, SIGMA_PX) * QUANTA) / QUANTA
+    counts = rng.poisson(base * gaussian_filter(clear, SIGMA_PX) * quanta) / quanta
     values = 60000 - 50000 * counts if bright else 50000 * counts
     return np.clip(np.rint(values), 0, 65535).astype(np.uint16), np.array(tips), np.array(ways)
 
@@ -75,6 +76,24 @@ def test_finds_all_tips_within_their_stated_errors(kind: str) -> None:
         assert 0.5 < np.sqrt(np.mean((missed / stated) ** 2)) < 2.0
     angle = np.rad2deg(np.arctan2(-way[:, 1], way[:, 0]))
     assert np.abs((found.angle_deg - angle + 180) % 360 - 180).max() < 1.0
+
+
+def test_what_is_common_to_the_pins_of_a_film_is_as_far_off_as_stated() -> None:
+    rng = np.random.default_rng(100)
+    square = []
+    for _ in range(8):  # whatever moves all tips of a film alike does so once a film
+        values, tips, ways = film_of_pins(rng, slope=0.4, quanta=QUANTA / 4)
+        found = detect_markers(values, bits=16).images
+        found = found.rows(found.shape == "pin")
+        assert len(found) == len(tips)
+        nearest = np.hypot(*(found.position_px[:, None] - tips).transpose(2, 0, 1)).argmin(axis=1)
+        way = ways[nearest]
+        missed = np.einsum("ni,ni->n", found.position_px - tips[nearest], way)
+        square.append(missed**2 / np.einsum("ni,nij,nj->n", way, found.covariance_px2, way))
+    ratio = float(np.sqrt(np.mean(square)))
+    print(f"error / stated {ratio:.2f}; largest {np.sqrt(np.max(square)):.1f}")
+    assert 0.7 < ratio < 1.3  # eight films hold a dozen independent errors or so
+    assert np.max(square) < 4.0**2
 
 
 def test_a_rod_is_no_pin() -> None:
