@@ -102,7 +102,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
         # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
         company = _of_like_spread(_spread(fits, sigma_px), sure) >= _COMPANY
         alone = close & (strength > ALONE) & ~_soft_shadows(fits.radius_px, height, sure & company)
-        return np.asarray(sure & (company | alone))
+        return np.asarray((sure & (company | alone)) | (_like_these(sure & company, fits, height) & (strength > max(0.5 * SURE, limit))))
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
     least = np.where(close, FAINT, UNEXCUSED)
@@ -113,6 +113,14 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
     return np.asarray((fits.significance > limit) & alike & (sure | (strength > 0.5 * SURE)))
+
+
+def _like_these(known: Bool, fits: BallFits, height: Float) -> Bool:
+    """Say what is no smaller, larger or much fainter than these."""
+    if not known.any():
+        return known
+    low, high = fits.radius_px[known].min(), fits.radius_px[known].max()
+    return np.asarray((fits.radius_px >= low) & (fits.radius_px <= high) & (height > UNEXCUSED * np.median(height[known])))
 
 
 def _soft_shadows(radius_px: Float, height: Float, known: Bool) -> Bool:
