@@ -18,7 +18,7 @@ RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are wha
 _STEPS, _QUICK_STEPS = 12, 4
 _REWEIGHTED = (1, 2)  # steps
 _FADED = 4.0  # blur widths beyond the rim where nothing is left of a ball's image that noise would let be seen
-_LARGE_PX = 27  # side of a window of which a first look does not need every pixel
+_SPARSE_PX = 14  # pixels either way that a first look needs of a window
 _CONVERGED_PX = 2e-4
 _NEAR_PX = 5e-3  # enough for a first look
 _MAX_STEP_PX = 0.7
@@ -142,14 +142,14 @@ def fit_balls(
     quick : bool
         For a first look: a third of the steps at most, and covariances as if the noise were white.
     sparse : bool
-        For a first look at much that is nothing: of large windows only every second pixel either way.
+        For a first look at much that is nothing: of large windows only every second to fourth pixel either way.
 
     Returns
     -------
     BallFits
     """
     sigma_px, mu_px = optics.sigma_px, optics.mu_px
-    stride = 2 if sparse and patches.size > _LARGE_PX else 1
+    stride = max(patches.size // _SPARSE_PX, 1) if sparse else 1
     n, size = len(start_px), patches.size
     half = size // 2
     table = ball_table(round(mu_px * sigma_px, 3))

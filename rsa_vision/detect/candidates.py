@@ -24,7 +24,7 @@ MARGIN = 128  # overlap of bands; more than the reach of the coarsest filter
 BLOCK = 32  # side of the blocks of one pyramid level over which the spread is measured
 # (pyramid level, inner sigma, outer sigma in pixels of that level, radius in film pixels that answers best)
 SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
-REACH = 4.0  # blur widths to which kernels go
+REACH = 3.0  # blur widths to which kernels go
 FAINT = 0.86  # of what counts as significant: extrema of so much are listed too, for looks that know what they look for
 ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
 JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for

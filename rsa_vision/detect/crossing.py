@@ -21,7 +21,7 @@ from rsa_vision.types import Float, Int
 _STEPS, _QUICK_STEPS = 16, 5
 _CONVERGED_PX = 0.02  # a step's change: what is left after it is a tenth of that, and the last fit follows
 _NEAR_PX = 0.1  # enough for a first look
-_AROUND_PX = 4.0  # beyond three blurs from the arms, which tell the background
+_AROUND_PX, _CLOSE_PX = 4.0, 1.0  # beyond three blurs from the arms, which tell the background; the same for a first look
 _LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
 _GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
 
@@ -73,6 +73,7 @@ def window_of(
     optics: Optics,
     noise: NoiseModel,
     others: Images | None,
+    around_px: float = _AROUND_PX,
 ) -> Window:
     """Cut out the pixels around the arms of some needles, the images of others taken away."""
     middle = np.mean([f.position_px for f in needles], axis=0)
@@ -84,7 +85,7 @@ def window_of(
     near = np.zeros((patch.size, patch.size), bool)
     for f in needles:
         dx, dy = (axis + (first - at) for first, at in zip(corner, f.position_px, strict=True))
-        near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + _AROUND_PX)
+        near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + around_px)
     rows, cols = np.nonzero(near & patch.valid[0])
     raw = patch.values[0][rows, cols]
     first, box = int(cols.min(initial=patch.size)), (int(np.ptp(rows)) + 1, int(np.ptp(cols)) + 1)
@@ -135,7 +136,7 @@ def fit_crossing(
         In the order of the starts, with the covariances of these; figures of merit are taken under each needle's own arms.
     """
     now = list(needles)
-    window = window_of(film, now, optics, noise, others)
+    window = window_of(film, now, optics, noise, others, _CLOSE_PX if quick else _AROUND_PX)
     steps, near = (min(steps, _QUICK_STEPS), _NEAR_PX) if quick else (steps, _CONVERGED_PX)
     cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.half
     weight = 1.0 / noise.variance_at(data + window.beside)

@@ -66,6 +66,8 @@ def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
         flat, straight = fit_group(*at), fit_group(*at, edge=True)
         models = [(0.0 if straight.converged.all() else -np.inf, straight)]
         for taken, bent in ((True, False), (False, True), (True, True)):
+            if taken and bent and len(models) > 1 and max(models, key=lambda model: model[0]) is models[0]:
+                break  # what neither gains alone both do not
             other = fit_group(*at, edge=True, taken=taken, bent=bent)
             if other.converged.all():
                 models.append((_gain(other, straight, noise) - _MORE_GAIN * (taken + bent), other))

@@ -17,7 +17,7 @@ from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
-BATCH = 48  # windows that stay in the cache
+BATCH = 96  # windows that stay in the cache
 _LIKE = 1.25  # ratio of their sizes
 _PADDED = 10_000  # pixels by which smaller ones may be too large besides: another batch costs as much
 STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
@@ -28,7 +28,7 @@ MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum 
 DOUBTFUL = 0.6  # of it: more may be two balls, or something else
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
-PROMISING = 0.75  # of the significance a mark must have: a quick fit may be so far off
+PROMISING = 0.85  # of the significance a mark must have: better fits are 3 % more significant mostly, 10 % at the most
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 

@@ -24,7 +24,7 @@ LEAST = 8  # marks, and places, that tell something
 _NOTHING = 0.01  # places leave less only where there is no noise
 _MOST = 0.4, 2.5  # what they may tell
 _WHOLE, _INSIDE = 0.95, 0.8  # of the pixels under a ball, and of its window
-_ASKED = 24  # sure candidates
+_ASKED, _PLACES = 24, 100  # sure candidates; free places of one size, which tell more
 _QUARTILE = 0.25  # that tells: what is no ball leaves more
 _MORE = 1.3  # times the variance under them that is none by chance, and worth it
 _DOUBLINGS = np.linspace(0.0, 5.0, 21)  # of the variance: hardly anything comes through the middle of a ball where nothing is scattered
@@ -65,7 +65,8 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
         return noise
     places = free_places(film, sure, seeds.position_px, seeds.radius_px + guess.sigma_px, guess, noise)
     reach_px = float(np.median(sure.radius_px)) + guess.sigma_px
-    beside = np.concatenate([_ripple(t.values, noise.variance_at(t.values.mean(axis=1))[:, None], None, reach_px) for t in places])
+    some = [t.values[:: 1 + len(t.values) // _PLACES] for t in places]
+    beside = np.concatenate([_ripple(values, noise.variance_at(values.mean(axis=1))[:, None], None, reach_px) for values in some])
     if len(beside) < LEAST:
         return noise
     fits = fit_at(film, sure.position_px, sure.radius_px, guess, noise, quick=True)

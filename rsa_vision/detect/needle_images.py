@@ -284,9 +284,11 @@ class _Seen:
             value, *more = _look_up(_table(*self.key, 0.0, "")[:last], self.at_s, self.at_p)
         else:
             off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
-            tables = [_table(*self.key, q, "ends")[:last] for q in np.round(slants[0] - off_q, 4).tolist()]
-            parts = [slice(*ends) for ends in pairwise(np.searchsorted(self.arm, np.arange(len(tables) + 1)))]
-            found = [_look_up(table, self.at_s[i], self.at_p[i]) for table, i in zip(tables, parts, strict=True)]
+            of_arms = np.round(slants[0] - off_q, 4)
+            first = np.append(0, np.flatnonzero(np.diff(of_arms)) + 1)  # most arms share a table with the one before
+            parts = pairwise(np.searchsorted(self.arm, np.append(first, len(of_arms))).tolist())
+            tables = [_table(*self.key, q, "ends")[:last] for q in of_arms[first].tolist()]
+            found = [_look_up(table, self.at_s[i:end], self.at_p[i:end]) for table, (i, end) in zip(tables, parts, strict=True)]
             value, *more = np.concatenate(found, axis=1)
             value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
         value += (shape.half_width_px - self.key[0]) * more[0] + (shape.length_px - self.key[1]) * more[1]

@@ -235,8 +235,8 @@ def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
         return _lag_zero(), 0.0
     tiles = (rest / np.sqrt(np.maximum(variance, 1e-12))[:, None]).reshape(-1, side, side)
     size = 2 * side
-    spectrum = np.abs(rfft2(tiles, s=(size, size))) ** 2
-    sums = irfft2(spectrum.mean(0), s=(size, size))
+    spectrum = np.abs(rfft2(tiles.astype(np.float32), s=(size, size))) ** 2  # as in influence_covariance
+    sums = irfft2(spectrum.mean(0, dtype=np.float64), s=(size, size))
     lag = np.arange(-LAGS, LAGS + 1)
     pairs = (side - np.abs(lag))[:, None] * (side - np.abs(lag))[None, :]
     auto = sums[np.ix_(lag % size, lag % size)] / pairs

@@ -127,12 +127,13 @@ def _most_likely(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
         say /= 1 + say * own / _ODD
         normal = np.einsum("n,nij->ij", say, now.normal) + expected.T @ expected
         step = np.linalg.solve(normal, say @ now.right - expected.T @ _unexpected(optics, fits))
+        if (np.abs(step) < _SETTLED * np.sqrt(np.diag(np.linalg.inv(normal)))).all():
+            optics = _stepped(optics, step)  # so little is gained for certain
+            break
         step *= min(1.0, _MOST_BY_STEP / float(np.abs(step).max()))
         expected_before = np.square(_unexpected(optics, fits)).sum()
         for _ in range(_SHORTER):
-            sigma = float(np.clip(optics.sigma_px * np.exp(step[0]), *_SIGMA_PX))
-            kappa = float(np.clip(optics.mu_px * optics.sigma_px * np.exp(step[1]), *_KAPPA))
-            trial = Optics(sigma, kappa / sigma)
+            trial = _stepped(optics, step)
             moved = fit_at(film, fits.position_px, fits.radius_px, trial, noise, quick=True)
             then = _equations(film, moved, first, halves, trial, noise)
             gain = np.clip(say * (now.left - then.left), -_ODD, _ODD)  # a fit that has gone elsewhere does not decide
@@ -142,9 +143,14 @@ def _most_likely(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
             step = step / 3
         else:
             break
-        if (np.abs(step) < _SETTLED * np.sqrt(np.diag(np.linalg.inv(normal)))).all():
-            break
     return optics, ball_evidence(fits, noise)
+
+
+def _stepped(optics: Optics, step: Float) -> Optics:
+    """Optics after a step of the logarithms of blur and of attenuation along it."""
+    sigma = float(np.clip(optics.sigma_px * np.exp(step[0]), *_SIGMA_PX))
+    kappa = float(np.clip(optics.mu_px * optics.sigma_px * np.exp(step[1]), *_KAPPA))
+    return Optics(sigma, kappa / sigma)
 
 
 def _unexpected(optics: Optics, fits: BallFits) -> Float:

@@ -39,9 +39,8 @@ class Painted:
         if cols.size == 0:
             return total
         side = self.images.shape[1]
-        (left, right), (top, bottom) = ((round(float(at.min())), round(float(at.max()))) for at in (cols, rows))
-        low, high = np.array([left - side, top - side]), np.array([right, bottom])
-        near = np.flatnonzero(((self.corner_px <= high) & (self.corner_px > low)).all(axis=1))
+        ends = zip(self.corner_px.T, (cols, rows), strict=True)
+        near = np.flatnonzero(np.logical_and(*((first < at.max() + 1) & (first > at.min() - side - 1) for first, at in ends)))
         place = [np.rint(at).astype(np.intp) for at in (cols, rows)] if len(near) else []
         for k in near:
             col, row = (at - first for at, first in zip(place, self.corner_px[k], strict=True))

@@ -94,7 +94,7 @@ def free_places(film: NDArray[Any], balls: BallFits, others_px: Float, reach_px:
         nearest = half + balls.radius_px[index] + 3 * optics.sigma_px
         distance = nearest[:, None] * np.repeat(_FARTHER, len(_DIRECTIONS))
         place = balls.position_px[index, None] + distance[:, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        gap = np.abs(place[:, :, None] - marks).max(axis=3)
+        gap = np.maximum(*(np.abs(place[:, :, None, k] - marks[:, k]) for k in (0, 1)))
         ball, where = np.nonzero((gap > half + reach).all(axis=2))
         patches = cut(film, place[ball, where], int(half), noise)
         whole = patches.valid.all(axis=(1, 2))

@@ -110,8 +110,8 @@ def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
     """Say whether a fit looks like a tee: little misfit, arms square to each other, all of it on the film."""
     if not np.isfinite(fit.misfit) or fit.significance < 6.0 or fit.valid_fraction < 0.6:
         return False
-    turn = np.angle(np.exp(1j * (fit.angles - fit.angles[0])))
-    square = abs(turn[1] - np.pi / 2) < 0.35 and abs(turn[2] + np.pi / 2) < 0.35
+    first, *others = fit.angles.tolist()
+    square = all(abs(math.remainder(a - first - at, math.tau)) < 0.35 for a, at in zip(others, (math.pi / 2, -math.pi / 2), strict=True))
     slim = fit.shape.length_px > 2.0 * fit.shape.half_width_px and fit.shape.length_px > RINGS_PX[0] and fit.n_core > _LEAST_PIXELS
     return bool(square and slim and fit.misfit < 1.3 * MISFIT * slack and explains(fit, 1 - (1 - EXPLAINED) * slack))
 
