@@ -32,6 +32,7 @@ _SAME_JUNCTION = 0.5  # of the length of its arms, from a junction to the tip fi
 _MOST_JUNCTIONS = 80
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _FAINTEST = 0.05  # of the depth of the film's clearest tee: a film linear in exposure has little of it behind thick tissue
+_TOUCHING = 1.05  # of the lengths of two tees, by which tips are apart whose arms reach each other; ends are blurred
 _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _NEAREST_PX = 3.0  # two tips nearer than this are one
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
@@ -179,7 +180,8 @@ def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optic
     starts: list[tuple[float, NeedleFit]] = []
     painted, seen = paint([(t, optics) for t in tees]), template_of(model, optics)
     for tee in tees:
-        half = int(2.5 * tee.shape.length_px)
+        # tips as far away as thick ends can touch, and all of their arms
+        half = int(_TOUCHING * (tee.shape.length_px + model.shape.length_px)) + SCALE * (len(seen) // 2 + 1)
         left, top = (max(int(x) - half, 0) // SCALE * SCALE for x in tee.position_px)
         box = film[top : top + 2 * half, left : left + 2 * half]
         for col, row, likeness in find_like(painted.taken_from(box, left, top), seen):
