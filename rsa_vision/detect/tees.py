@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.covered import find_covered
 from rsa_vision.detect.crossing import fit_crossing, moved
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.junctions import RINGS_PX
@@ -77,6 +78,12 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     if optics.rough:
         optics, _ = common_optics(film, tees, optics, noise)  # where arms cross hardly depends on where they end
         tees = fit_all(film, tees, optics, noise)
+    clean = [t for t in tees if is_tee(t)]
+    if len(clean) >= _LEAST_PARALLEL:
+        film, more = find_covered(film, clean, optics, noise, _FAINTEST)
+        rough = [t for t in tees if not is_tee(t)]  # those to the same tees were worse
+        tees = clean + [t for t in rough if all(math.dist(t.position_px, m.position_px) > _SAME_JUNCTION * m.shape.length_px for m in more)]
+        tees += more
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
