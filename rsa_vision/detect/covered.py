@@ -1,7 +1,7 @@
 """Tees under scratches, wires, letters and edges: two of their arms are seen, and what most of the pixels agree with is a tee.
 
-What the tees of a film look like is known by then: how large they are, and which way they point. Arms like theirs are looked for one by one,
-so that what hides one of them leaves the others as they are. Pixels that a robust fit leaves over are taken out of the film.
+What the tees of a film look like is known by then: how large they are, and which way they point. Arms like theirs are looked for one by
+one, so that what hides one of them leaves the others as they are. Pixels that a robust fit leaves over are taken out of the film.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.crossing import Window, fit_crossing, window_of
-from rsa_vision.detect.find import DOUBTFUL, EXPLAINED, MISFIT, SURE
+from rsa_vision.detect.find import EXPLAINED, MISFIT, SURE
 from rsa_vision.detect.foreign import beyond_noise, robust_residual
 from rsa_vision.detect.needle_images import Images, NeedleFit, arm_images, needle_image
 from rsa_vision.detect.needle_sets import others_beside
@@ -31,10 +31,12 @@ _MOST_LOOKED_AT: Final = 40
 _RIM: Final = 2  # pixels of the search around an arm, which tell its background
 _FADED: Final = 0.05  # of the highest of an arm
 _NEAREST_PX: Final = 3.0  # two tips nearer than this are one
+_PASSES: Final = 2  # what was found hides others
 _ROUNDS: Final = 3  # the first mask is that of a fit which the foreign thing has pulled
 _TIP_ERROR_PX, _SIZE_ERROR, _TURN_ERROR = 1.0, 0.05, 0.03  # of a start: in pixels, in parts, in radians
 _TWO_ARMS, _STEM = 0.5, 0.25  # part of two arms, and of the stem, that has to be seen: a bar alone may be anything
-_ALIKE, _ALIKE_WIDE = 0.05, 0.2  # radians and parts by which a film's tees differ, half widths more: they stand for depth where ends are hidden
+_CLOSE: Final = 0.4  # of the misfit that a mark may leave: what hides a tee may pull at it without being seen
+_ALIKE, _WIDE = 0.05, 0.2  # radians and parts by which tees of a film differ; half widths more, which stand for depth
 
 
 def find_covered(
@@ -55,43 +57,47 @@ def find_covered(
     Returns
     -------
     film : ndarray of shape (rows, cols)
-        NaN where something hides them; the same film if none was found.
+        NaN where something hides them.
     tees : list of NeedleFit
     """
-    model = sorted(known, key=lambda t: t.shape.length_px)[len(known) // 2]
-    places = [(place, part) for place, part in _two_arms(film, known, model, optics) if part > faintest]
-    if not places:
-        return film, []
-    bare, out = film.astype(np.float32), list(known)
-    for place, part in places:
-        if not _apart(place, out):
-            continue
-        start = replace(model, position_px=place, depth=part * model.depth, depths=part * model.depths, slants=None)
-        fit, (rows, cols) = _robust(film, bare, start, others_beside(start, out, optics), optics, noise)
-        if _is_one(fit, _seen(bare, fit, optics)) and _is_like(fit, known) and _apart(fit.position_px, out):
-            out.append(fit)
-        else:
-            bare[rows, cols] = film[rows, cols]
-    return (bare, out[len(known) :]) if len(out) > len(known) else (film, [])
+    by_size = sorted(known, key=lambda t: t.shape.length_px)
+    model, *ends = (by_size[part * (len(known) - 1) // 4] for part in (2, 1, 3))  # fiducial marks and control points may be of two sizes
+    bare, tees = film.astype(np.float32), list(known)
+    for _ in range(_PASSES):
+        before = len(tees)
+        for start in _two_arms(film, tees, model, optics):
+            if abs(start.depth) < faintest * abs(model.depth) or not _apart(start, tees):
+                continue
+            others = others_beside(start, tees, optics)
+            tried = [_robust(film, bare, replace(start, shape=end.shape), others, optics, noise) for end in ends]
+            fit, hidden = min(tried, key=lambda one: len(one[1][0]))
+            uncovered, bare[hidden] = bare[hidden], np.nan
+            if _is_one(fit, _seen(bare, fit, optics)) and _is_like(fit, known) and _apart(fit, tees):
+                tees.append(fit)
+            else:
+                bare[hidden] = uncovered
+        if len(tees) == before:
+            break
+    return bare, tees[len(known) :]
 
 
-def _apart(place_px: Float, tees: list[NeedleFit]) -> bool:
-    return all(math.dist(t.position_px, place_px) > _NEAREST_PX for t in tees)
+def _apart(fit: NeedleFit, tees: list[NeedleFit]) -> bool:
+    return all(math.dist(t.position_px, fit.position_px) > _NEAREST_PX for t in tees)
 
 
-def _two_arms(film: NDArray[Any], known: list[NeedleFit], model: NeedleFit, optics: Optics) -> list[tuple[Float, float]]:
-    """Return places where two arms or more are like those of a known tee, best first, and their depth as a part of its depth."""
+def _two_arms(film: NDArray[Any], known: list[NeedleFit], model: NeedleFit, optics: Optics) -> list[NeedleFit]:
+    """Return starts where two arms or more are like those of a known tee, best first; the middle one of the arms tells how deep."""
     n_rows, n_cols = (n // SCALE for n in film.shape)
     whole = cv2.medianBlur(film[: n_rows * SCALE, : n_cols * SCALE], 3)  # scratches are a pixel or two wide
     image = cv2.resize(paint([(t, optics) for t in known]).taken_from(whole, 0, 0), (n_cols, n_rows), interpolation=cv2.INTER_AREA)
     reach = math.ceil((model.shape.length_px + 3 * optics.sigma_px) / SCALE) + _RIM
     image = cv2.copyMakeBorder(image, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
-    axis = SCALE * np.arange(-reach, reach + 1.0)
+    cols_of, rows_of = np.meshgrid(*[SCALE * np.arange(-reach, reach + 1.0)] * 2)
     coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, SCALE / np.sqrt(12))))
     arms, likeness = [], []
     for k in range(len(model.angles)):
         one = replace(model, angles=model.angles[[k]], depths=model.depths[[k]], slants=None)
-        arm = needle_image(*np.meshgrid(axis, axis), one, coarse).astype(np.float32)
+        arm = needle_image(cols_of, rows_of, one, coarse).astype(np.float32)
         under = np.abs(arm) > _FADED * np.abs(arm).max()
         rows, cols = (slice(max(int(at[0]) - _RIM, 0), int(at[-1]) + _RIM + 1) for at in (np.flatnonzero(under.any(a)) for a in (1, 0)))
         arms.append((arm[rows, cols] - arm[rows, cols].mean(), rows, cols))
@@ -102,24 +108,24 @@ def _two_arms(film: NDArray[Any], known: list[NeedleFit], model: NeedleFit, opti
     row, col = np.nonzero(peak)
     out = []
     for i in np.argsort(-second[peak])[:_MOST_LOOKED_AT]:
-        box = image[row[i] : row[i] + len(axis), col[i] : col[i] + len(axis)]
+        box = image[row[i] : row[i] + len(rows_of), col[i] : col[i] + len(rows_of)]
         parts = [float((box[rows, cols] * arm).sum() / np.square(arm).sum()) for arm, rows, cols in arms]
-        out.append((SCALE * np.array([col[i], row[i]]) + (SCALE - 1) / 2, float(np.median(parts))))
+        part, place = float(np.median(parts)), SCALE * np.array([col[i], row[i]]) + (SCALE - 1) / 2
+        out.append(replace(model, position_px=place, depth=part * model.depth, depths=part * model.depths, slants=None))
     return out
 
 
 def _robust(
     film: NDArray[Any], bare: NDArray[Any], fit: NeedleFit, others: Images | None, optics: Optics, noise: NoiseModel
 ) -> tuple[NeedleFit, tuple[Int, Int]]:
-    """Fit a tee without what is foreign in its window, whose pixels (rows, columns) are made NaN in ``bare``."""
-    hidden = (np.zeros(0, np.intp),) * 2
+    """Fit a tee without what is foreign in its window, and return the pixels (rows, columns) of that; ``bare`` is left as it was."""
     for _ in range(_ROUNDS):
-        bare[hidden] = film[hidden]
         window = window_of(film, [fit], optics, noise, others)
         off = _foreign(window, fit, optics, noise)
         hidden = window.rows[off].astype(np.intp), window.cols[off].astype(np.intp)
-        bare[hidden] = np.nan
+        before, bare[hidden] = bare[hidden], np.nan
         fit = fit_crossing(bare, [fit], optics, noise, others=others)[0]
+        bare[hidden] = before
         if not explains(fit, PROMISING, 0.0):
             break
     return fit, hidden
@@ -149,9 +155,9 @@ def _seen(bare: NDArray[Any], fit: NeedleFit, optics: Optics) -> Float:
 
 
 def _is_one(fit: NeedleFit, seen: Float) -> bool:
-    """Say whether enough of a tee is seen, and explained as closely as a ball of which only a part is: noise is no excuse here."""
+    """Say whether enough of a tee is seen and explained so well that little that is foreign can be left in it: noise is no excuse here."""
     enough = float(np.sort(seen)[-2]) > _TWO_ARMS and seen[0] > _STEM
-    close = fit.misfit < DOUBTFUL * MISFIT and fit.explained > EXPLAINED
+    close = fit.misfit < _CLOSE * MISFIT and fit.explained > EXPLAINED
     return enough and close and fit.significance > SURE * np.sqrt(max(fit.chi2_ring, 1.0))
 
 
@@ -159,6 +165,6 @@ def _is_like(fit: NeedleFit, known: list[NeedleFit]) -> bool:
     def unlike(tee: NeedleFit) -> float:
         turn = float(np.angle(np.exp(1j * (fit.angles[0] - tee.angles[0]))))
         longer, wider = math.log(fit.shape.length_px / tee.shape.length_px), math.log(fit.shape.half_width_px / tee.shape.half_width_px)
-        return max(abs(turn) / _ALIKE, abs(longer) / _ALIKE, abs(wider) / _ALIKE_WIDE)
+        return max(abs(turn) / _ALIKE, abs(longer) / _ALIKE, abs(wider) / _WIDE)
 
     return min(map(unlike, known)) < 1.0

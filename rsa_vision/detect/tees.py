@@ -78,17 +78,23 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     if optics.rough:
         optics, _ = common_optics(film, tees, optics, noise)  # where arms cross hardly depends on where they end
         tees = fit_all(film, tees, optics, noise)
-    clean = [t for t in tees if is_tee(t)]
-    if len(clean) >= _LEAST_PARALLEL:
-        film, more = find_covered(film, clean, optics, noise, _FAINTEST)
-        rough = [t for t in tees if not is_tee(t)]  # those to the same tees were worse
-        tees = clean + [t for t in rough if all(math.dist(t.position_px, m.position_px) > _SAME_JUNCTION * m.shape.length_px for m in more)]
-        tees += more
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
-    others = [t for t in tees if not is_tee(t, slack=_BEFORE)] + [replace(t, slants=None) for t in fitted if not is_tee(t)]
+    others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
+    clean = [t for t in fitted if is_tee(t)]
+    if len(clean) >= _LEAST_PARALLEL:
+        bare, more = find_covered(film, clean, optics, noise, _FAINTEST)
+        if more:
+            others, rough = (_elsewhere(those, more) for those in (others, [t for t in fitted if not is_tee(t)]))
+            fitted, optics = fit_shared(bare, [*clean, *rough, *more], optics, noise, parallel=True)
+    others += [replace(t, slants=None) for t in fitted if not is_tee(t)]
     return [t for t in fitted if is_tee(t)], [t for t in others if is_tee(t, slack=ROUGH)], optics
+
+
+def _elsewhere(rough: list[NeedleFit], known: list[NeedleFit]) -> list[NeedleFit]:
+    """Leave out rough fits to what is known by now."""
+    return [t for t in rough if all(math.dist(t.position_px, k.position_px) > _SAME_JUNCTION * k.shape.length_px for k in known)]
 
 
 def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> Optics:
