@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.covered import find_covered
 from rsa_vision.detect.crossing import fit_crossing, moved
-from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
+from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, DOUBTFUL, EXPLAINED, MISFIT
 from rsa_vision.detect.junctions import RINGS_PX
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
@@ -82,19 +82,20 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
-    clean = [t for t in fitted if is_tee(t)]
+    clean = [t for t in fitted if is_tee(t) and t.misfit < DOUBTFUL * MISFIT]
     if len(clean) >= _LEAST_PARALLEL:
         bare, more = find_covered(film, clean, optics, noise, _FAINTEST)
         if more:
-            others, rough = (_elsewhere(those, more) for those in (others, [t for t in fitted if not is_tee(t)]))
+            rough = _apart([t for t in fitted if all(t is not c for c in clean)], more, _NEAREST_PX)
+            others = _apart(others, more, _SAME_JUNCTION * clean[0].shape.length_px)
             fitted, optics = fit_shared(bare, [*clean, *rough, *more], optics, noise, parallel=True)
     others += [replace(t, slants=None) for t in fitted if not is_tee(t)]
     return [t for t in fitted if is_tee(t)], [t for t in others if is_tee(t, slack=ROUGH)], optics
 
 
-def _elsewhere(rough: list[NeedleFit], known: list[NeedleFit]) -> list[NeedleFit]:
+def _apart(rough: list[NeedleFit], known: list[NeedleFit], gap_px: float) -> list[NeedleFit]:
     """Leave out rough fits to what is known by now."""
-    return [t for t in rough if all(math.dist(t.position_px, k.position_px) > _SAME_JUNCTION * k.shape.length_px for k in known)]
+    return [t for t in rough if all(math.dist(t.position_px, k.position_px) > gap_px for k in known)]
 
 
 def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> Optics:

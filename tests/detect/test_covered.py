@@ -1,0 +1,99 @@
+"""Tees of which something else hides a part: found where two of their arms are seen, within their stated errors, and nothing besides."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from rsa_vision.detect import detect_markers
+from rsa_vision.flags import MarkerFlag
+from rsa_vision.types import Float, MarkerImages
+from synthetic.chords import chord_pin
+
+PITCH_MM, MU_PER_MM, SIGMA_PX, QUANTA, FINE = 0.1, 8.0, 1.0, 800.0, 9
+SIDE, CELLS, LENGTH_PX = 600, 4, 20
+ARMS = np.deg2rad([97.0, 187.0, 7.0])  # stem first; counter-clockwise as displayed
+
+
+def light_past_tees(tips: Float, deep: Float) -> Float:
+    """Light that comes past tees of 0.5 x 2 mm, exact chords; ``deep``: the part of what they absorb that a film shows."""
+    clear, half = np.ones((SIDE, SIDE)), 34
+    for tip, part in zip(tips, deep, strict=True):
+        corner = tip.astype(int) - half
+        line = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5
+        x, y = np.meshgrid(line + corner[0] - tip[0], line + corner[1] - tip[1])
+        origin, down = np.array([x * PITCH_MM, y * PITCH_MM, 0 * x]), np.array([0 * x, 0 * x, 0 * x + 1])
+        chord = sum(chord_pin(origin, down, np.zeros(3), np.array([np.cos(a), -np.sin(a), 0.0]), 2.0, 0.25) for a in ARMS)
+        light = np.exp(-MU_PER_MM * chord).reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
+        clear[corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= 1 - part * (1 - light)
+    return clear
+
+
+def tips_of(rng: np.random.Generator) -> Float:
+    rows, cols = np.divmod(np.arange(CELLS**2), CELLS)
+    return (np.stack([cols, rows], axis=1) + 0.5) * (SIDE / CELLS) + rng.uniform(-12, 12, (CELLS**2, 2))
+
+
+def exposed(clear: Float, rng: np.random.Generator) -> np.ndarray:
+    counts = rng.poisson(0.6 * gaussian_filter(clear, SIGMA_PX) * QUANTA) / QUANTA
+    return np.clip(np.rint(50000 * counts), 0, 65535).astype(np.uint16)
+
+
+def check(found: MarkerImages, tips: Float, seen: list[int]) -> None:
+    """All of ``tips`` are found, nothing else, and those of ``seen`` within what is stated of them."""
+    assert found.shape.tolist() == ["tee"] * len(tips)
+    nearest = np.hypot(*(found.position_px - tips[:, None]).transpose(2, 0, 1)).argmin(axis=1)
+    assert sorted(nearest) == list(range(len(tips)))
+    for k in seen:
+        error = found.position_px[nearest[k]] - tips[k]
+        z2 = error @ np.linalg.solve(found.covariance_px2[nearest[k]], error)
+        print(f"tee {k}: error {np.hypot(*error):.3f} px, {np.sqrt(z2):.1f} sd")
+        assert np.hypot(*error) < 0.2
+        assert z2 < 13.8  # of chi2 with two degrees of freedom one in a thousand is more
+
+
+@pytest.mark.parametrize("turn", [20.0, 60.0, 110.0, 160.0])
+def test_under_a_scratch(turn: float) -> None:
+    rng = np.random.default_rng(int(turn))
+    tips = tips_of(rng)
+    film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
+    c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
+    along = np.arange(-55, 55, 0.4)[:, None]
+    through = tips[5] + [3.0, -4.0] + along * [c, s]
+    film[tuple(np.rint(through.T[::-1]).astype(int))] = rng.integers(1000, 3000, len(through))
+    check(detect_markers(film, bits=16).images, tips, [5])
+
+
+@pytest.mark.parametrize("place", ["on the stem", "on an arm"])
+def test_beside_a_letter(place: str) -> None:
+    rng = np.random.default_rng(3)
+    tips = tips_of(rng)
+    clear = light_past_tees(tips, np.ones(len(tips)))
+    col, row = np.rint(tips[5]).astype(int)
+    if place == "on the stem":
+        clear[row - 60 : row - 13, col - 20 : col + 3] *= 0.03
+    else:
+        clear[row - 30 : row + 30, col + 11 : col + 22] *= 0.03
+    found = detect_markers(exposed(clear, rng), bits=16).images
+    check(found.rows(found.shape == "tee"), tips, [5])
+
+
+@pytest.mark.parametrize("faint", [0.15, 0.4])
+def test_a_faint_one_that_a_clear_one_touches(faint: float) -> None:
+    rng = np.random.default_rng(4)
+    tips = tips_of(rng)
+    tips = np.concatenate([tips, tips[[5]] + [1.95 * LENGTH_PX, 4.0]])
+    found = detect_markers(exposed(light_past_tees(tips, np.append(np.ones(CELLS**2), faint)), rng), bits=16).images
+    check(found, tips, [5, CELLS**2])
+
+
+def test_at_the_edge_of_the_film() -> None:
+    """Of a column of tees the left arm is cut off."""
+    rng = np.random.default_rng(6)
+    tips = tips_of(rng)
+    cut, column = 8, np.arange(CELLS**2) % CELLS == 0
+    tips[column, 0] = 50 + rng.uniform(-2, 2, CELLS)
+    left = 50 - cut
+    film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)[:, left:]
+    found = detect_markers(np.ascontiguousarray(film), bits=16).images
+    check(found, tips - [left, 0], np.flatnonzero(column).tolist())
+    assert (found.flags[found.position_px[:, 0] < LENGTH_PX] & MarkerFlag.EDGE).all()
