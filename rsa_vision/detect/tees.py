@@ -33,6 +33,7 @@ _SAME_JUNCTION = 0.5  # of the length of its arms, from a junction to the tip fi
 _MOST_JUNCTIONS = 80
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _FAINTEST = 0.05  # of the depth of the film's clearest tee: a film linear in exposure has little of it behind thick tissue
+_ACROSS = 1.0  # of the length of a tee: arms of nearer ones cross its own
 _TOUCHING = 1.05  # of the lengths of two tees, by which tips are apart whose arms reach each other; ends are blurred
 _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _NEAREST_PX = 3.0  # two tips nearer than this are one
@@ -203,7 +204,10 @@ def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optic
             if min(math.dist(t.position_px, place) for t in tees) > _NEAREST_PX:
                 starts.append((likeness, replace(model, position_px=place)))
     best = [start for _, start in sorted(starts, key=lambda item: -item[0])]
-    return _peeled(film, best, optics, noise, tees)[len(tees) :]
+    found = _peeled(film, best, optics, noise, tees)[len(tees) :]
+    # where arms only touch, a first look is as good as a last one
+    across = [any(math.dist(f.position_px, t.position_px) < _ACROSS * t.shape.length_px for t in tees) for f in found]
+    return [f for f, near in zip(found, across, strict=True) if near or is_tee(f)]
 
 
 def _peeled(

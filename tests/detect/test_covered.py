@@ -70,7 +70,7 @@ def test_beside_a_letter(place: str) -> None:
     clear = light_past_tees(tips, np.ones(len(tips)))
     col, row = np.rint(tips[5]).astype(int)
     if place == "on the stem":
-        clear[row - 60 : row - 13, col - 20 : col + 3] *= 0.03
+        clear[row - 60 : row - 15, col - 20 : col + 3] *= 0.03
     else:
         clear[row - 30 : row + 30, col + 11 : col + 22] *= 0.03
     found = detect_markers(exposed(clear, rng), bits=16).images
