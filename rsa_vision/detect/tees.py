@@ -33,7 +33,7 @@ _SAME_JUNCTION = 0.5  # of the length of its arms, from a junction to the tip fi
 _MOST_JUNCTIONS = 80
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
 _FAINTEST = 0.05  # of the depth of the film's clearest tee: a film linear in exposure has little of it behind thick tissue
-_ACROSS = 1.0  # of the length of a tee: arms of nearer ones cross its own
+_ACROSS = 1.5  # of the length of a tee, less what its image is wider by blur: arms of nearer ones cross its own
 _TOUCHING = 1.05  # of the lengths of two tees, by which tips are apart whose arms reach each other; ends are blurred
 _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _NEAREST_PX = 3.0  # two tips nearer than this are one
@@ -206,7 +206,8 @@ def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optic
     best = [start for _, start in sorted(starts, key=lambda item: -item[0])]
     found = _peeled(film, best, optics, noise, tees)[len(tees) :]
     # where arms only touch, a first look is as good as a last one
-    across = [any(math.dist(f.position_px, t.position_px) < _ACROSS * t.shape.length_px for t in tees) for f in found]
+    blurred = SCALE * (len(seen) // 2) - model.shape.length_px
+    across = [any(math.dist(f.position_px, t.position_px) < _ACROSS * t.shape.length_px - blurred for t in tees) for f in found]
     return [f for f, near in zip(found, across, strict=True) if near or is_tee(f)]
 
 
