@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.covered import find_covered
 from rsa_vision.detect.crossing import fit_crossing, moved
-from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, DOUBTFUL, EXPLAINED, MISFIT
+from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.junctions import RINGS_PX
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
@@ -83,7 +83,7 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
-    clean = [t for t in fitted if is_tee(t) and t.misfit < DOUBTFUL * MISFIT]
+    clean = [t for t in fitted if is_tee(t)]
     if len(clean) >= _LEAST_PARALLEL:
         bare, more = find_covered(film, clean, optics, noise, _FAINTEST)
         if more:
