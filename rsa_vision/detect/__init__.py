@@ -20,9 +20,10 @@ from rsa_vision.detect.find import MISFIT, STRENGTH, fit_at, plausible, signific
 from rsa_vision.detect.leftover import noise_under
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needle_images import NeedleFit
+from rsa_vision.detect.needle_sets import on_arms
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.painted import paint
-from rsa_vision.detect.pins import MOST_STROKES, find_pins, look_for_pins, on_arms
+from rsa_vision.detect.pins import MOST_STROKES, find_pins, look_for_pins
 from rsa_vision.detect.polarity import first_looks, off_pins, polarities
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
@@ -120,7 +121,8 @@ def _one_polarity(
 ) -> tuple[float, Detection]:
     junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
     mine = replace(candidates.rows(np.sign(candidates.strength) == -sign), junctions=junctions)
-    tees, doubtful, tee_optics = find_tees(film, junctions, optics, noise)
+    strokes = faint.strokes[np.sign(faint.strokes[:, 5]) == -sign]
+    tees, doubtful, tee_optics = find_tees(film, junctions, strokes, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seeds, optics, noise), strict=True) if not ball]
     more_pins = look_for_pins(film, candidates.strokes[~on_arms(candidates.strokes[:, :2], tees)], noise)

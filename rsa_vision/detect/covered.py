@@ -18,7 +18,7 @@ from rsa_vision.detect.crossing import Window, fit_crossing, window_of
 from rsa_vision.detect.find import EXPLAINED, MISFIT, SURE
 from rsa_vision.detect.foreign import beyond_noise, robust_residual
 from rsa_vision.detect.needle_images import Images, NeedleFit, arm_images, needle_image
-from rsa_vision.detect.needle_sets import others_beside
+from rsa_vision.detect.needle_sets import on_arms, others_beside
 from rsa_vision.detect.needles import PROMISING, explains
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import paint
@@ -40,7 +40,7 @@ _ALIKE, _WIDE = 0.05, 0.2  # radians and parts by which tees of a film differ; h
 
 
 def find_covered(
-    film: NDArray[Any], known: list[NeedleFit], optics: Optics, noise: NoiseModel, faintest: float
+    film: NDArray[Any], known: list[NeedleFit], strokes: Float, optics: Optics, noise: NoiseModel, faintest: float
 ) -> tuple[NDArray[Any], list[NeedleFit]]:
     """Find tees of which something else hides a part.
 
@@ -49,6 +49,8 @@ def find_covered(
     film : ndarray of shape (rows, cols)
     known : list of NeedleFit
         Clean tees of the film, all that were found.
+    strokes : ndarray of shape (n, 6)
+        What may be arms of others: nothing is looked for but around those that are none of these.
     optics : Optics
     noise : NoiseModel
     faintest : float
@@ -62,10 +64,11 @@ def find_covered(
     """
     by_size = sorted(known, key=lambda t: t.shape.length_px)
     model, *ends = (by_size[part * (len(known) - 1) // 4] for part in (2, 1, 3))  # fiducial marks and control points may be of two sizes
-    bare, tees = film.astype(np.float32), list(known)
+    bare, tees = film, list(known)
     for _ in range(_PASSES):
         before = len(tees)
-        for start in _two_arms(film, tees, model, optics):
+        for start in _two_arms(film, strokes[:, :2], tees, model, optics):
+            bare = film.astype(np.float32) if bare is film else bare
             if abs(start.depth) < faintest * abs(model.depth) or not _apart(start, tees):
                 continue
             others = others_beside(start, tees, optics)
@@ -85,34 +88,56 @@ def _apart(fit: NeedleFit, tees: list[NeedleFit]) -> bool:
     return all(math.dist(t.position_px, fit.position_px) > _NEAREST_PX for t in tees)
 
 
-def _two_arms(film: NDArray[Any], known: list[NeedleFit], model: NeedleFit, optics: Optics) -> list[NeedleFit]:
-    """Return starts where two arms or more are like those of a known tee, best first; the middle one of the arms tells how deep."""
-    n_rows, n_cols = (n // SCALE for n in film.shape)
-    whole = cv2.medianBlur(film[: n_rows * SCALE, : n_cols * SCALE], 3)  # scratches are a pixel or two wide
-    image = cv2.resize(paint([(t, optics) for t in known]).taken_from(whole, 0, 0), (n_cols, n_rows), interpolation=cv2.INTER_AREA)
+def _two_arms(film: NDArray[Any], strokes_px: Float, known: list[NeedleFit], model: NeedleFit, optics: Optics) -> list[NeedleFit]:
+    """Return starts beside strokes where two arms or more are like those of a known tee, best first."""
+    strokes_px = strokes_px[~on_arms(strokes_px, known)]
+    if len(strokes_px) == 0:
+        return []
+    arms, painted = _arms(model, optics), paint([(t, optics) for t in known])
     reach = math.ceil((model.shape.length_px + 3 * optics.sigma_px) / SCALE) + _RIM
-    image = cv2.copyMakeBorder(image, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    half = math.ceil(model.shape.length_px) + SCALE * reach
+    found: dict[tuple[float, float], tuple[float, NeedleFit]] = {}
+    for stroke in strokes_px:
+        left, top = (max(int(x) - half, 0) // SCALE * SCALE for x in stroke)
+        box = film[top : top + 2 * half, left : left + 2 * half]
+        n_rows, n_cols = (n // SCALE for n in box.shape)
+        whole = cv2.medianBlur(box[: n_rows * SCALE, : n_cols * SCALE], 3)  # scratches are a pixel or two wide
+        image = cv2.resize(painted.taken_from(whole, left, top), (n_cols, n_rows), interpolation=cv2.INTER_AREA)
+        image = cv2.copyMakeBorder(image, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+        second = _second_likeness(image, arms, (n_rows, n_cols))
+        row, col = np.nonzero((second > _LIKENESS) & (second == cv2.dilate(second, np.ones((5, 5), np.uint8))))
+        places = SCALE * np.stack([col, row], axis=1) + (SCALE - 1) / 2 + [left, top]
+        for r, c, place in zip(row, col, places, strict=True):
+            if math.dist(place, stroke) < model.shape.length_px:
+                around = image[r : r + 2 * reach + 1, c : c + 2 * reach + 1]
+                part = float(np.median([(around[rows, cols] * arm).sum() / np.square(arm).sum() for arm, rows, cols in arms]))
+                start = replace(model, position_px=place, depth=part * model.depth, depths=part * model.depths, slants=None)
+                found[place[0], place[1]] = float(second[r, c]), start
+    return [start for _, start in sorted(found.values(), key=lambda one: -one[0])[:_MOST_LOOKED_AT]]
+
+
+def _arms(model: NeedleFit, optics: Optics) -> list[tuple[NDArray[np.float32], slice, slice]]:
+    """Images of a tee's arms, each alone and less its mean, and where in the box around the tip they are."""
+    reach = math.ceil((model.shape.length_px + 3 * optics.sigma_px) / SCALE) + _RIM
     cols_of, rows_of = np.meshgrid(*[SCALE * np.arange(-reach, reach + 1.0)] * 2)
     coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, SCALE / np.sqrt(12))))
-    arms, likeness = [], []
+    arms = []
     for k in range(len(model.angles)):
         one = replace(model, angles=model.angles[[k]], depths=model.depths[[k]], slants=None)
         arm = needle_image(cols_of, rows_of, one, coarse).astype(np.float32)
         under = np.abs(arm) > _FADED * np.abs(arm).max()
         rows, cols = (slice(max(int(at[0]) - _RIM, 0), int(at[-1]) + _RIM + 1) for at in (np.flatnonzero(under.any(a)) for a in (1, 0)))
         arms.append((arm[rows, cols] - arm[rows, cols].mean(), rows, cols))
-        like = cv2.matchTemplate(image, arm[rows, cols], cv2.TM_CCOEFF_NORMED)
-        likeness.append(like[rows.start : rows.start + n_rows, cols.start : cols.start + n_cols])
-    second = np.ascontiguousarray(np.sort(likeness, axis=0)[-2])
-    peak = (second > _LIKENESS) & (second == cv2.dilate(second, np.ones((5, 5), np.uint8)))
-    row, col = np.nonzero(peak)
-    out = []
-    for i in np.argsort(-second[peak])[:_MOST_LOOKED_AT]:
-        box = image[row[i] : row[i] + len(rows_of), col[i] : col[i] + len(rows_of)]
-        parts = [float((box[rows, cols] * arm).sum() / np.square(arm).sum()) for arm, rows, cols in arms]
-        part, place = float(np.median(parts)), SCALE * np.array([col[i], row[i]]) + (SCALE - 1) / 2
-        out.append(replace(model, position_px=place, depth=part * model.depth, depths=part * model.depths, slants=None))
-    return out
+    return arms
+
+
+def _second_likeness(image: NDArray[Any], arms: list[tuple[NDArray[np.float32], slice, slice]], shape: tuple[int, int]) -> NDArray[Any]:
+    """Return the second best of the arms' correlation coefficients for tips at the pixels of an image, its border left out."""
+    likeness = []
+    for arm, rows, cols in arms:
+        like = cv2.matchTemplate(image, arm, cv2.TM_CCOEFF_NORMED)
+        likeness.append(like[rows.start : rows.start + shape[0], cols.start : cols.start + shape[1]])
+    return np.ascontiguousarray(np.sort(likeness, axis=0)[-2])
 
 
 def _robust(

@@ -81,3 +81,17 @@ def _images(near: list[NeedleFit], optics: Optics) -> Images | None:
         return total
 
     return images
+
+
+def on_arms(places: Float, needles: list[NeedleFit]) -> Bool:
+    """Say which places (n, 2) lie on an arm of a needle."""
+    return np.asarray(np.any([np.zeros(len(places), bool), *(_on_arm(places, needle) for needle in needles)], axis=0))
+
+
+def _on_arm(places: Float, needle: NeedleFit) -> Bool:
+    """Say which places (n, 2) lie on one of a needle's arms or just beyond its ends, shape (n,)."""
+    dx, dy = (places - needle.position_px).T[:, :, None]
+    c, s = np.cos(needle.angles), -np.sin(needle.angles)
+    along, across = (dx * c + dy * s) / needle.shape.length_px, np.abs(dy * c - dx * s) / needle.shape.half_width_px
+    on: Bool = ((along > -0.3) & (along < 1.2) & (across < 2)).any(axis=1)
+    return on

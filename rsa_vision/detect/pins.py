@@ -13,7 +13,7 @@ from rsa_vision.detect.crossing import chi2_of, window_of
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
-from rsa_vision.detect.needle_sets import MOST_TOGETHER, TAPERS, fit_all
+from rsa_vision.detect.needle_sets import MOST_TOGETHER, TAPERS, fit_all, on_arms
 from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
@@ -180,7 +180,7 @@ def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
     """
     on = np.zeros(len(position_px), bool)
     for pin in pins:
-        on |= (left > 1 - pin.explained) & _on_arm(position_px, pin)
+        on |= (left > 1 - pin.explained) & on_arms(position_px, [pin])
     return on
 
 
@@ -279,17 +279,3 @@ def _middle(fit: NeedleFit) -> Float:
     half, angle = 0.5 * fit.shape.length_px, float(fit.angles[0])
     middle: Float = fit.position_px + half * np.array([math.cos(angle), -math.sin(angle)])
     return middle
-
-
-def on_arms(places: Float, needles: list[NeedleFit]) -> Bool:
-    """Say which places (n, 2) lie on an arm of a needle."""
-    return np.asarray(np.any([np.zeros(len(places), bool), *(_on_arm(places, needle) for needle in needles)], axis=0))
-
-
-def _on_arm(places: Float, needle: NeedleFit) -> Bool:
-    """Say which places (n, 2) lie on one of a needle's arms or just beyond its ends, shape (n,)."""
-    dx, dy = (places - needle.position_px).T[:, :, None]
-    c, s = np.cos(needle.angles), -np.sin(needle.angles)
-    along, across = (dx * c + dy * s) / needle.shape.length_px, np.abs(dy * c - dx * s) / needle.shape.half_width_px
-    on: Bool = ((along > -0.3) & (along < 1.2) & (across < 2)).any(axis=1)
-    return on

@@ -42,7 +42,9 @@ _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
 
 
-def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], list[NeedleFit], Optics]:
+def find_tees(
+    film: NDArray[Any], junctions: Float, strokes: Float, optics: Optics, noise: NoiseModel
+) -> tuple[list[NeedleFit], list[NeedleFit], Optics]:
     """Find and fit all tees of one polarity.
 
     Parameters
@@ -50,6 +52,8 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     film : ndarray of shape (rows, cols)
     junctions : ndarray of shape (n, 5)
         As of :func:`rsa_vision.detect.junctions.find_junctions`, one polarity.
+    strokes : ndarray of shape (m, 6)
+        As of :func:`rsa_vision.detect.strokes.find_strokes`, of the same.
     optics : Optics
     noise : NoiseModel
 
@@ -85,7 +89,7 @@ def find_tees(film: NDArray[Any], junctions: Float, optics: Optics, noise: Noise
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
     clean = [t for t in fitted if is_tee(t)]
     if len(clean) >= _LEAST_PARALLEL:
-        bare, more = find_covered(film, clean, optics, noise, _FAINTEST)
+        bare, more = find_covered(film, clean, strokes, optics, noise, _FAINTEST)
         if more:
             rough = _apart([t for t in fitted if all(t is not c for c in clean)], more, _NEAREST_PX)
             others = _apart(others, more, _SAME_JUNCTION * clean[0].shape.length_px)
