@@ -35,4 +35,4 @@ def test_nothing_left_of_what_looked_like_tees_is_no_error(monkeypatch: pytest.M
     monkeypatch.setattr(tees, "_models", lambda *_: [model])
     monkeypatch.setattr(tees, "_like", lambda *_: [])
     optics = Optics(1.0, 0.5)
-    assert find_tees(film, np.zeros((1, 5)), optics, estimate_noise(film, 16)) == ([], [], optics)
+    assert find_tees(film, np.zeros((1, 5)), np.zeros((0, 6)), optics, estimate_noise(film, 16)) == ([], [], optics)
