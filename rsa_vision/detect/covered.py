@@ -18,7 +18,7 @@ from rsa_vision.detect.crossing import Window, fit_crossing, window_of
 from rsa_vision.detect.find import EXPLAINED, MISFIT, SURE
 from rsa_vision.detect.foreign import beyond_noise, robust_residual
 from rsa_vision.detect.needle_images import Images, NeedleFit, arm_images, needle_image
-from rsa_vision.detect.needle_sets import on_arms, others_beside
+from rsa_vision.detect.needle_sets import NEAREST_PX, on_arms, others_beside
 from rsa_vision.detect.needles import PROMISING, explains
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import paint
@@ -30,7 +30,6 @@ _LIKENESS: Final = 0.5  # correlation coefficient that two arms have to reach
 _MOST_LOOKED_AT: Final = 40
 _RIM: Final = 2  # pixels of the search around an arm, which tell its background
 _FADED: Final = 0.05  # of the highest of an arm
-_NEAREST_PX: Final = 3.0  # two tips nearer than this are one
 _PASSES: Final = 2  # what was found hides others
 _ROUNDS: Final = 3  # the first mask is that of a fit which the foreign thing has pulled
 _TIP_ERROR_PX, _SIZE_ERROR, _TURN_ERROR = 1.0, 0.05, 0.03  # of a start: in pixels, in parts, in radians
@@ -85,7 +84,7 @@ def find_covered(
 
 
 def _apart(fit: NeedleFit, tees: list[NeedleFit]) -> bool:
-    return all(math.dist(t.position_px, fit.position_px) > _NEAREST_PX for t in tees)
+    return all(math.dist(t.position_px, fit.position_px) > NEAREST_PX for t in tees)
 
 
 def _two_arms(film: NDArray[Any], strokes_px: Float, known: list[NeedleFit], model: NeedleFit, optics: Optics) -> list[NeedleFit]:

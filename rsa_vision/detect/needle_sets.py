@@ -17,6 +17,7 @@ from rsa_vision.types import Bool, Float
 
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
 MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
+NEAREST_PX = 3.0  # two tips nearer than this are one
 _BESIDE_PX = 10.0  # from the ends of arms, a little longer than they are, within which others are beside them
 
 

@@ -13,7 +13,7 @@ from rsa_vision.detect.crossing import chi2_of, window_of
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
-from rsa_vision.detect.needle_sets import MOST_TOGETHER, TAPERS, fit_all, on_arms
+from rsa_vision.detect.needle_sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, on_arms
 from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
@@ -31,7 +31,6 @@ _SURER_THAN_ROD = 12.0  # half the chi2 by which a rod must be worse
 _LEAST_OF_A_KIND = 3  # clear pins from which a film is one of pins: others then need less
 _RATHER_THAN_ROD, _RATHER_THAN_TURNED = 2.5, 7.0
 _ROD = 0.02  # taper of a rod: blunt
-_NEAREST_PX = 3.0
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
@@ -265,7 +264,7 @@ def _left(fit: NeedleFit) -> float:
 def _distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
     for fit in sorted(pins, key=_left):
-        if all(math.dist(fit.position_px, k.position_px) > _NEAREST_PX and not _same_body(fit, k) for k in kept):
+        if all(math.dist(fit.position_px, k.position_px) > NEAREST_PX and not _same_body(fit, k) for k in kept):
             kept.append(fit)
     return kept
 

@@ -16,7 +16,7 @@ from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MIS
 from rsa_vision.detect.junctions import RINGS_PX
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
-from rsa_vision.detect.needle_sets import MOST_TOGETHER, TAPERS, fit_all, others_beside
+from rsa_vision.detect.needle_sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles import explains, fit_needles
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.painted import paint
@@ -36,7 +36,6 @@ _FAINTEST = 0.05  # of the depth of the film's clearest tee: a film linear in ex
 _ACROSS = 1.5  # of the length of a tee, less what its image is wider by blur: arms of nearer ones cross its own
 _TOUCHING = 1.05  # of the lengths of two tees, by which tips are apart whose arms reach each other; ends are blurred
 _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
-_NEAREST_PX = 3.0  # two tips nearer than this are one
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
 _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
@@ -91,7 +90,7 @@ def find_tees(
     if len(clean) >= _LEAST_PARALLEL:
         bare, more = find_covered(film, clean, strokes, optics, noise, _FAINTEST)
         if more:
-            rough = _apart([t for t in fitted if all(t is not c for c in clean)], more, _NEAREST_PX)
+            rough = _apart([t for t in fitted if all(t is not c for c in clean)], more, NEAREST_PX)
             others = _apart(others, more, _SAME_JUNCTION * clean[0].shape.length_px)
             fitted, optics = fit_shared(bare, [*clean, *rough, *more], optics, noise, parallel=True)
     others += [replace(t, slants=None) for t in fitted if not is_tee(t)]
@@ -190,7 +189,7 @@ def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: No
         if free[i]:
             start = replace(models[model[i]], position_px=places[i, :2])
             starts += moved([start], step[[i]], int(start.shape.length_px) * 2)
-            free &= np.hypot(*(places[:, :2] - places[i, :2]).T) > _NEAREST_PX
+            free &= np.hypot(*(places[:, :2] - places[i, :2]).T) > NEAREST_PX
     return _peeled(film, starts, optics, noise)
 
 
@@ -205,7 +204,7 @@ def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optic
         box = film[top : top + 2 * half, left : left + 2 * half]
         for col, row, likeness in find_like(painted.taken_from(box, left, top), seen):
             place = np.array([col + left, row + top])
-            if min(math.dist(t.position_px, place) for t in tees) > _NEAREST_PX:
+            if min(math.dist(t.position_px, place) for t in tees) > NEAREST_PX:
                 starts.append((likeness, replace(model, position_px=place)))
     best = [start for _, start in sorted(starts, key=lambda item: -item[0])]
     found = _peeled(film, best, optics, noise, tees)[len(tees) :]
@@ -228,8 +227,8 @@ def _peeled(
         others = others_beside(start, kept, optics)
         fit = fit_crossing(film, [start], optics, noise, others=others, quick=True)[0]
         deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > _FAINTEST * abs(start.depth)
-        near = math.dist(fit.position_px, start.position_px) < 2 * _NEAREST_PX
-        if deep and near and is_tee(fit, slack=ROUGH) and all(math.dist(k.position_px, fit.position_px) > _NEAREST_PX for k in kept):
+        near = math.dist(fit.position_px, start.position_px) < 2 * NEAREST_PX
+        if deep and near and is_tee(fit, slack=ROUGH) and all(math.dist(k.position_px, fit.position_px) > NEAREST_PX for k in kept):
             kept.append(fit)
             in_vain = 0
     return kept
@@ -239,6 +238,6 @@ def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
     for fit in sorted(tees, key=lambda f: f.misfit + 1 - f.explained):
         deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > _FAINTEST * abs(model.depth)
-        if deep and is_tee(fit, slack=ROUGH) and all(math.dist(fit.position_px, k.position_px) > _NEAREST_PX for k in kept):
+        if deep and is_tee(fit, slack=ROUGH) and all(math.dist(fit.position_px, k.position_px) > NEAREST_PX for k in kept):
             kept.append(fit)
     return kept
