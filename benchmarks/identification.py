@@ -31,12 +31,12 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from rsa_vision.batch import THREAD_VARIABLES
 from rsa_vision.cages import Cage, Mark, Plane, load_cage
 from rsa_vision.examination import ExaminationResult, name_and_reconstruct
 from rsa_vision.identify.cage import identify_cage
 from rsa_vision.readings import FilmReading
 from rsa_vision.settings import Study
+from rsa_vision.threads import THREAD_VARIABLES
 from rsa_vision.types import MarkerImages
 from synthetic.point_films import Exposure, FilmTruth, Objects, Rng, expose, random_exposure, random_objects
 from synthetic.sufficient import coordinates_over, focus_sd_mm

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from rsa_vision.errors import FilmError, RsaError, UsageError
 from rsa_vision.provenance import file_sha256, version
@@ -20,12 +18,11 @@ from rsa_vision.settings import Study
 from rsa_vision.store import fingerprint, is_finished, read_record, record_path, write_record
 from rsa_vision.study_files import ExamFiles, printable
 from rsa_vision.tables import Rows, examination_rows, failed_rows
+from rsa_vision.threads import one_thread_each
 
 if TYPE_CHECKING:
     from rsa_vision.cages import Cage
     from rsa_vision.cameras import Camera
-
-THREAD_VARIABLES: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +180,7 @@ def _run_pool(tasks: Sequence[Task], jobs: int, timeout_s: float | None, watch: 
     from pebble import ProcessPool
 
     done: dict[int, Outcome] = {}
-    with _one_thread_each(), ProcessPool(max_workers=jobs, context=get_context("spawn"), initializer=_start_worker) as pool:
+    with one_thread_each(), ProcessPool(max_workers=jobs, context=get_context("spawn"), initializer=_start_worker) as pool:
         try:
             futures: dict[Future[Outcome], int] = {
                 pool.schedule(work, args=(task,), timeout=timeout_s): index for index, task in enumerate(tasks)
@@ -220,18 +217,3 @@ def _start_worker() -> None:
     import cv2
 
     cv2.setNumThreads(1)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let spawned processes start with one thread for BLAS: it reads the variables when it is loaded."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
