@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 import typer
 
 from rsa_vision import cli_motion
-from rsa_vision.threads import one_thread_unless_told
 
 if TYPE_CHECKING:
     from rsa_vision.api import Summary
@@ -43,7 +42,6 @@ StudyOption = Annotated[Path | None, typer.Option("--study", help="Study file.")
 
 def main() -> NoReturn:
     """Run the command line; expected failures become one message and their exit code, never a traceback."""
-    one_thread_unless_told()
     sys.exit(run_app(sys.argv[1:]))
 
 

@@ -22,6 +22,7 @@ from rsa_vision.images import require_pitch
 from rsa_vision.readings import FilmReading, Readings, candidates, image_quality, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Study
 from rsa_vision.sightlines import Sightlines, by_cage, by_cameras, left_open, single_images
+from rsa_vision.threads import in_one_thread
 from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
 from rsa_vision.xray import rays_of, reconstruct, reconstruct_calibrated, solve_focus
@@ -65,6 +66,7 @@ class ExaminationResult:
     sightlines: Sightlines = field(default_factory=Sightlines.none)
 
 
+@in_one_thread
 def measure_examination(
     films: Sequence[ExposedFilm],
     study: Study,
@@ -105,6 +107,7 @@ def measure_examination(
     return replace(result, seconds=seconds)
 
 
+@in_one_thread
 def name_and_reconstruct(
     films: Sequence[FilmReading], study: Study, geometry: Cage | Mapping[int, Camera], *, n_cage_films: int = 0
 ) -> ExaminationResult:

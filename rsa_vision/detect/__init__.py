@@ -35,6 +35,7 @@ from rsa_vision.detect.strokes import at_junctions
 from rsa_vision.detect.surroundings import free_places
 from rsa_vision.detect.table import WHOLE, table_of, what_is_left
 from rsa_vision.detect.tees import find_tees, is_tee
+from rsa_vision.threads import in_one_thread
 from rsa_vision.types import Bool, Float, MarkerImages
 
 __all__ = ["Detection", "detect_markers"]
@@ -63,6 +64,7 @@ class Detection:
     noise: NoiseModel
 
 
+@in_one_thread
 def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", false_detections: float = 0.1) -> Detection:
     """Find and measure all marker images of a film.
 

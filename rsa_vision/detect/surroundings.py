@@ -37,6 +37,8 @@ class Places:
         The balls whose windows are of that size.
     near : ndarray of int, shape (k,)
         Which of those ``m`` each window is near.
+    cell : ndarray of int, shape (k, 2)
+        (col, row) of the window in which it begins, were the film paved with such: windows of one cell show much the same.
     values : ndarray of shape (k, pixels)
         Of the film.
     """
@@ -44,6 +46,7 @@ class Places:
     half: int
     balls: Int
     near: Int
+    cell: Int
     values: NDArray[Any]
 
 
@@ -98,7 +101,8 @@ def free_places(film: NDArray[Any], balls: BallFits, others_px: Float, reach_px:
         ball, where = np.nonzero((gap > half + reach).all(axis=2))
         patches = cut(film, place[ball, where], int(half), noise)
         whole = patches.valid.all(axis=(1, 2))
-        out.append(Places(int(half), index, ball[whole], patches.values[whole].reshape(-1, patches.size**2).astype(film.dtype)))
+        values = patches.values[whole].reshape(-1, patches.size**2).astype(film.dtype)
+        out.append(Places(int(half), index, ball[whole], patches.corner_px[whole] // patches.size, values))
     return out
 
 
@@ -207,9 +211,11 @@ def around_each(figures: list[Float], places: list[Places], count: int, least: f
     if not enough.any():
         return np.ones((count, width))
     together = np.concatenate(logs)
-    sure = min(quantile + _SURE * np.sqrt(quantile * (1 - quantile) / len(together)), 1.0)
-    usual, high = np.quantile(together, [quantile, sure], axis=0)
-    caution = np.maximum(np.minimum(high, 0.0) - usual, 0.0)  # less than was promised is believed as far as it cannot be chance
+    apart = sum(len(np.unique(these.cell, axis=0)) for these in places)
+    sure = quantile + _SURE * np.sqrt(quantile * (1 - quantile) / apart)
+    usual, high = np.quantile(together, [quantile, min(sure, 1.0)], axis=0)
+    # less than was promised is believed as far as it cannot be chance
+    caution = np.maximum((np.minimum(high, 0.0) if sure < 1 else 0.0) - usual, 0.0)
     usual_error = error[enough].mean(axis=0)
     between = np.maximum(np.square(own[enough] - usual).mean(axis=0) - usual_error, 0.0)
     weight = between / np.maximum(between + usual_error, 1e-30) * enough[:, None]

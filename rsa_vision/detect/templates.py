@@ -23,7 +23,7 @@ from rsa_vision.types import Bool, Float
 LIKENESS = 0.4  # correlation coefficient from which a place is worth a fit; two tees one over the other reach 0.5 to 0.7
 SCALE = 2  # the film is searched at half resolution
 _BAND = 256  # rows of that, which stay in the cache
-_APART = 2  # pixels of that, between peaks
+_AROUND = np.arange(-2, 3)  # pixels of that, over which a peak is the highest
 _SPARSE = 16  # every so-manieth pixel tells the mean of a film
 _LEAST_VARIANCE = 0.02  # of rounded values, means of four
 
@@ -54,12 +54,14 @@ def find_like(film: NDArray[Any], template: NDArray[np.float32]) -> Float:
     side = len(template)
     found = [np.zeros((0, 3))]
     for first in range(0, n_rows - side + 1 if min(n_rows, n_cols) > side else 0, _BAND):
-        top, bottom = max(first - _APART, 0), min(first + _BAND + _APART + side - 1, n_rows)
+        top, bottom = max(first + _AROUND[0], 0), min(first + _BAND + _AROUND[-1] + side - 1, n_rows)
         band = film[SCALE * top : SCALE * bottom, : SCALE * n_cols]
-        likeness = _correlation(cv2.resize(band, (n_cols, bottom - top), interpolation=cv2.INTER_AREA).astype(np.float32), template)
+        likeness = _correlation(cv2.resize(band, (n_cols, bottom - top), interpolation=cv2.INTER_AREA), template)
         row, col = np.divmod(np.flatnonzero(likeness > LIKENESS), likeness.shape[1])
-        around = cv2.dilate(likeness, np.ones((2 * _APART + 1,) * 2, np.uint8))
-        peak = (likeness[row, col] == around[row, col]) & (row >= first - top) & (row < first - top + _BAND)
+        # few places are alike: to look around those costs less than a filter over all
+        around = [axis[:, None] + _AROUND for axis in (row, col)]
+        highest = likeness[np.clip(around[0], 0, len(likeness) - 1)[:, :, None], np.clip(around[1], 0, likeness.shape[1] - 1)[:, None]]
+        peak = (likeness[row, col] == highest.max((1, 2))) & (row >= first - top) & (row < first - top + _BAND)
         row, col = row[peak], col[peak]
         centre = side // 2 + 0.5
         found.append(np.stack([(col + centre) * SCALE - 0.5, (row + top + centre) * SCALE - 0.5, likeness[row, col]], axis=1))
@@ -67,10 +69,10 @@ def find_like(film: NDArray[Any], template: NDArray[np.float32]) -> Float:
     return table[np.argsort(-table[:, 2])]
 
 
-def _correlation(image: NDArray[np.float32], template: NDArray[np.float32]) -> NDArray[np.float32]:
+def _correlation(image: NDArray[Any], template: NDArray[np.float32]) -> NDArray[np.float32]:
     """Correlation coefficient with all windows of an image, whose spread changes slowly from place to place: every second one tells it."""
     side, bare = len(template), template - template.mean()
-    image = image - image[::_SPARSE, ::_SPARSE].mean()
+    image = np.subtract(image, image[::_SPARSE, ::_SPARSE].mean(), dtype=np.float32)
     product = cv2.matchTemplate(image, bare, cv2.TM_CCORR)
     even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
     twice, box = even.shape[::-1], (side // 2 + 1) // 2 * 2 + 1  # odd, of about as many pixels as the template
