@@ -14,7 +14,7 @@ from rsa_vision.detect.patches import damped_solution
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float, Int
 
-OPTICS, SHARED = 3, 5  # common to all: attenuation, blur, taper; then logarithms of half width and length; then directions
+OPTICS, SHARED = 6, 8  # common to all: attenuation, blur, taper, curve (2), tail; then logarithms of half width and length; then directions
 SLANT, SKEW = 0.11, 0.08  # root mean squares, of a square and a product of slopes: rays cross a film at slopes of up to a half
 # slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
 OF_SLANTS = {
@@ -134,7 +134,7 @@ def linearise(
     ----------
     window : Window
     members : list of NeedleFit
-    slopes : list of ndarrays of shape (3, k, n)
+    slopes : list of ndarrays of shape (6, k, n)
         As of :func:`by_optics`, one for each.
     optics : Optics
     noise : NoiseModel
@@ -223,6 +223,6 @@ def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
 
 
 def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
-    """Derivatives of each member's arms by log attenuation, log blur and taper, shape (3, k, n)."""
+    """Derivatives of each member's arms by what is common, shape (6, k, n), as of :func:`arms_by_optics`."""
     offsets = [(window.cols - f.position_px[0], window.rows - f.position_px[1]) for f in members]
     return [arms_by_optics(*at, f.angles, f.shape, optics) for at, f in zip(offsets, members, strict=True)]

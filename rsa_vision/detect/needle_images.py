@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.profiles import TAIL, Optics
 from rsa_vision.types import Bool, Float, Int
 
 Images = Callable[[Float, Float], Float]
 """Images of some marks at pixels (cols, rows), in film values over the background."""
+_Key = tuple[float, float, float, Optics]  # of a table: half width, length, taper
 CELL = 0.3  # pixels between the nodes of a needle table
 GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
@@ -97,9 +98,7 @@ def _opacity(
     half_width: float,
     length: float,
     taper: float,
-    sigma: float,
-    mu: float,
-    bend: float,
+    optics: Optics,
     slant: float,
     wider: float = 1.0,
     longer: float = 1.0,
@@ -111,7 +110,7 @@ def _opacity(
     A ray in depth ``z`` of the needle crosses it at the distance ``s + sqrt(slant) z`` from the tip; of its chord only the part before the
     flat end counts. The middle of the chord lies the further behind the further it is from the axis: ``skew`` times the distance.
     """
-    first, (n_s, n_p) = _grid(half_width, length, sigma)
+    first, (n_s, n_p) = _grid(half_width, length, optics.sigma_px)
     cell_s, cell_p = CELL * longer, CELL * wider
     s = first[0] * longer + cell_s * np.arange(n_s)
     # without skew one half; the other is its mirror image
@@ -124,14 +123,26 @@ def _opacity(
     before = length - fine_s - skew * fine_p
     if slant:
         chord *= np.clip(0.5 + before / (np.sqrt(slant) * np.maximum(chord, 1e-9)), 0.0, 1.0)
-    opacity = -np.expm1(-mu * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
+    opacity = -np.expm1(-optics.mu_px * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
     opacity = opacity.reshape(len(s), 2, len(p), 2).mean((1, 3))
-    blur_s, blur_p = (np.sqrt(max((blurrier * sigma) ** 2 / cell**2 - _OF_TABLE, 0.1)) for cell in (cell_s, cell_p))
-    along = gaussian_filter1d(opacity, blur_s, axis=0, mode="constant", truncate=4.5)
-    seen: Float = gaussian_filter1d(along, blur_p, axis=1, mode="constant" if skew else "mirror", truncate=4.5)
-    if bend:
-        seen = np.log1p(-bend * seen) / np.log1p(-bend)
+
+    def blurred(sigma: float) -> Float:
+        blur_s, blur_p = (np.sqrt(max(sigma**2 / cell**2 - _OF_TABLE, 0.1)) for cell in (cell_s, cell_p))
+        along = gaussian_filter1d(opacity, blur_s, axis=0, mode="constant", truncate=4.5)
+        return np.asarray(gaussian_filter1d(along, blur_p, axis=1, mode="constant" if skew else "mirror", truncate=4.5))
+
+    seen = blurred(blurrier * optics.sigma_px)
+    if optics.tail:
+        seen += optics.tail * (blurred(TAIL * blurrier * optics.sigma_px) - seen)
+    if any(optics.curve):
+        seen += np.tensordot(optics.curve, of_curve(seen), axes=1)
     return seen if skew else np.concatenate([seen[:, :0:-1], seen], axis=1)
+
+
+def of_curve(opacity: Float) -> Float:
+    """What the coefficients of :attr:`Optics.curve` belong to, on a new first axis."""
+    bow = opacity * (1 - opacity)
+    return np.stack([bow, bow * (1 - 2 * opacity)])
 
 
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
@@ -143,26 +154,25 @@ def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, 
 
 @lru_cache(maxsize=1024)
 def _table_for(
-    width_step: int, length_step: int, taper: float, sigma_px: float, mu_px: float, bend: float
-) -> tuple[tuple[float, ...], tuple[float, float], tuple[float, float], tuple[float, float]]:
+    width_step: int, length_step: int, taper: float, optics: Optics
+) -> tuple[_Key, tuple[float, float], tuple[float, float], tuple[float, float]]:
     """Return the key of the table for about this size, where its grid begins and, in cells, its middle and how far it is seen."""
-    half_width, length, sigma = round(GRID**width_step, 4), round(GRID**length_step, 4), round(sigma_px, 3)
+    half_width, length, sigma = round(GRID**width_step, 4), round(GRID**length_step, 4), round(optics.sigma_px, 3)
     first, (n_s, n_p) = _grid(half_width, length, sigma)
     middle, rim = ((n_s - 1) / 2, (n_p - 1) / 2), (_PAD - _FADED) * sigma / CELL
-    key = half_width, length, round(taper, 3), sigma, round(mu_px, 4), round(bend, 4)
-    return key, first, middle, (middle[0] - rim, middle[1] - rim)
+    curve = round(optics.curve[0], 3), round(optics.curve[1], 3)
+    near = Optics(sigma, round(optics.mu_px, 4), curve, round(optics.tail, 3))
+    return (half_width, length, round(taper, 3), near), first, middle, (middle[0] - rim, middle[1] - rim)
 
 
 @lru_cache(maxsize=256)
-def _table(
-    half_width: float, length: float, taper: float, sigma: float, mu: float, bend: float, slant: float, more: str
-) -> NDArray[np.float32]:
+def _table(half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str) -> NDArray[np.float32]:
     """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
-    ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur and by
-    the taper, alone.
+    ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur, by
+    the taper, by the curve and by the tail, alone.
     """
-    one = half_width, length, taper, sigma, mu, bend, slant
+    one = half_width, length, taper, optics, slant
     base = _opacity(*one)
     nodes = [
         base,
@@ -174,9 +184,11 @@ def _table(
     nodes += np.gradient(base, CELL)
     if more == "optics":
         factor = float(np.exp(STEP))
-        dense, wide = _opacity(*one[:4], mu * factor, bend, slant), _opacity(*one, blurrier=factor)
-        short = _opacity(half_width, length, taper - STEP, *one[3:])
-        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
+        dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
+        wide, short = _opacity(*one, blurrier=factor), _opacity(half_width, length, taper - STEP, optics, slant)
+        straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0)), slant)
+        spread = _opacity(half_width, length, taper, replace(optics, tail=optics.tail + STEP), slant)
+        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *of_curve(straight), (spread - base) / STEP]
     table = np.array(nodes, np.float32)
     table[:, [0, -1]] = table[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return table
@@ -242,7 +254,7 @@ def arm_images(
 
 
 def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> Float:
-    """Derivatives of every arm by the logarithms of attenuation and blur, and by the taper; how the ends slant hardly matters."""
+    """Derivatives of every arm by log attenuation, log blur, taper, the two of the curve and tail; how the ends slant hardly matters."""
     seen = _Seen.of(dx, dy, angles, shape, optics)
     return seen.spread(_look_up(_table(*seen.key, 0.0, "optics"), seen.at_s, seen.at_p))
 
@@ -254,7 +266,7 @@ class _Seen:
     Tables stand on a grid of shapes, shared by all needles of a film, and are stretched; what else a size changes is linear in between.
     """
 
-    key: tuple[float, ...]  # of the table: shape, optics
+    key: _Key
     first: tuple[float, float]
     cell_s: float  # stretched
     cell_p: float
@@ -267,7 +279,7 @@ class _Seen:
     @staticmethod
     def of(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> _Seen:
         steps = (math.floor(math.log(size) / _LOG_GRID) for size in (shape.half_width_px, shape.length_px))
-        key, first, middle, reach = _table_for(*steps, shape.taper, optics.sigma_px, optics.mu_px, optics.bend)
+        key, first, middle, reach = _table_for(*steps, shape.taper, optics)
         cell_s, cell_p = CELL * shape.length_px / key[1], CELL * shape.half_width_px / key[0]
         c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
         at_s = dx * (c / cell_s) + (dy * (s / cell_s) - first[0] / CELL)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import polynomial
+from rsa_vision.detect.find import CHANCE
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape, arm_images, support
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import cut, damped_solution
@@ -198,3 +199,13 @@ def _unfit(tip: Float, angles: Float, shape: NeedleShape) -> NeedleFit:
     return NeedleFit(
         tip, angles, shape, np.zeros(len(angles)), 0.0, nan, np.full((2, 2), nan), 0, np.inf, np.inf, 0.0, 0.0, np.inf, 0.0, False
     )
+
+
+def excess_of(fit: NeedleFit, noise: NoiseModel) -> float:
+    """Chi2 under a needle where it is more than chance makes it."""
+    return fit.chi2_core if fit.chi2_core > 1 + CHANCE * noise.scatter(np.array(fit.n_core)) else 1.0
+
+
+def significant_misfit(fit: NeedleFit, noise: NoiseModel) -> float:
+    """Misfit of a needle that chance does not explain."""
+    return fit.misfit if excess_of(fit, noise) > 1.0 else 0.0

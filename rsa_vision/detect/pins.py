@@ -14,7 +14,7 @@ from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
 from rsa_vision.detect.needle_sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, on_arms
-from rsa_vision.detect.needles import explains, fit_needles
+from rsa_vision.detect.needles import excess_of, explains, fit_needles, significant_misfit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared
@@ -33,6 +33,7 @@ _RATHER_THAN_ROD, _RATHER_THAN_TURNED = 2.5, 7.0
 _ROD = 0.02  # taper of a rod: blunt
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
+_OF_CURVE, _OF_TAIL, _OF_MISFIT = 0.03, 0.03, 2.0  # errors along a pin over its length, by the fourth power of the first and by the others
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
 _OF_A_KIND = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
 _SAMPLE = 6
@@ -110,7 +111,7 @@ def find_pins(
         return [], optics
     optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
     more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
-    optics, along_px = common_optics(film, [f for f in sample + more if is_pin(f)], optics, noise)
+    optics = common_optics(film, [f for f in sample + more if is_pin(f)], optics, noise)
     sample = [_refit(film, f, optics, noise) for f in sample if is_pin(f)]
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
@@ -121,7 +122,7 @@ def find_pins(
     pins = _pointed(film, _distinct([f for f in pins if is_pin(f)]), optics, noise)
     pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
-    return [_less_sure_along(f, np.hypot(along_px, _POINT * f.shape.half_width_px)) for f in pins if is_pin(f)], optics
+    return [_less_sure_along(f, optics, noise) for f in pins if is_pin(f)], optics
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
@@ -251,8 +252,15 @@ def _proportion(pins: list[NeedleFit]) -> float:
     return float((b @ d + 0.5 * ratio / slack**2) / (b @ b + 1 / slack**2))
 
 
-def _less_sure_along(fit: NeedleFit, error_px: float) -> NeedleFit:
-    """Add an error along the pin: of the film curve, of a point that is no cone; across it there is nothing that they could move."""
+def _less_sure_along(fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
+    """Add an error along the pin: of film curve and blur as far as their models go, of what else lies there, of a point that is no cone.
+
+    Across the pin there is nothing that they could move.
+    """
+    by_rest = _OF_MISFIT * significant_misfit(fit, noise) / np.sqrt(excess_of(fit, noise))  # by that the table widens all of it
+    by_model = np.array([_OF_CURVE * optics.curve[0] ** 4, _OF_TAIL * optics.tail, by_rest])
+    parts = [_POINT * fit.shape.half_width_px, *(fit.shape.length_px * by_model)]
+    error_px = float(np.linalg.norm(parts))
     way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
     return replace(fit, covariance_px2=fit.covariance_px2 + error_px**2 * np.outer(way, way))
 

@@ -15,6 +15,7 @@ from scipy.special import i0e
 
 from rsa_vision.types import Float
 
+TAIL = 2.4  # times the blur, of the wider part of the light
 REACH = 6.0  # blur widths beyond the rim at which the image has faded (exp(-18))
 _Y_MIN, _Y_MAX = 0.4, 22.0  # r / sigma covered by the tables
 _X_STEP, _Y_STEP = 0.04, 0.02  # of rho / sigma, and of log(r / sigma), in the fine tables
@@ -31,9 +32,11 @@ class Optics:
         Blur: standard deviation of screen, focal spot and pixel together.
     mu_px : float
         Attenuation per pixel of chord. It takes part of the bend of the film curve: flatter tops, more attenuation.
-    bend : float
-        The rest of that bend, below 1, which no attenuation can stand for: the value of the film goes with ``-log(1 - bend * opacity)``, as
-        optical density does. 0: none.
+    curve : tuple of float
+        The rest of it, which pins tell: the film's value goes with ``o + curve[0] o (1 - o) + curve[1] o (1 - o) (1 - 2 o)``, ``o`` the
+        blurred opacity. Negative where film answers more the more of its light is gone, as density does.
+    tail : float
+        Part of the light that is spread ``TAIL`` times as far as the rest: of screens, scanners and scatter nearby.
     proportion : float
         Change of a needle's depth with the background along it, both in film values: on a film that is linear in exposure a mark takes away
         a part of what is there, on a logarithmic one always the same.
@@ -43,7 +46,8 @@ class Optics:
 
     sigma_px: float
     mu_px: float
-    bend: float = 0.0
+    curve: tuple[float, float] = (0.0, 0.0)
+    tail: float = 0.0
     proportion: float = 0.0
     rough: bool = False
 

@@ -22,6 +22,7 @@ _HIGH = 0.25  # of its background, the depth of the typical ball: of a lower one
 _OVER_NOISE = 10.0  # height of the typical ball in logarithms, over the noise of a pixel: of less, what is bent does not show
 _ASKED = 40  # balls, of all heights, that tell which scale is theirs
 _SIZES = (1.0, 1.6)  # in log odds, where one of them is in values
+_SURE = 2.0  # standard deviations
 _STRAIGHTER = 1.05  # times less that log odds leave of a ball's variance
 
 
@@ -117,7 +118,9 @@ def is_straighter(
     closest = min(seeds, key=lambda fits: float(np.median(1 - fits.explained)))
     its_optics, _ = estimate_optics(other, closest, other_noise)
     there = fit_at(other, balls.position_px, closest.radius_px, its_optics, other_noise)
-    return bool(np.median((1 - here.explained) / np.maximum(1 - there.explained, 1e-9)) > _STRAIGHTER)
+    less = (1 - here.explained) / np.maximum(1 - there.explained, 1e-9)
+    surely = np.quantile(less, max(0.5 - _SURE / (2 * np.sqrt(len(less))), 0.0))  # as low as the median may be by chance
+    return bool(np.median(less) > _STRAIGHTER and surely > 1)
 
 
 def in_film_values(images: MarkerImages, bits: int) -> MarkerImages:

@@ -25,7 +25,7 @@ from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Float
 
-_STEPS = 8
+_STEPS = 12
 # root mean square over the tips of pins and of tees, in standard deviations: by the former a few go to and fro for ever; three arms hold a
 # tip, so that after the latter the next step is a quarter of that
 _CONVERGED = {1: 0.15, 3: 0.25}
@@ -36,7 +36,11 @@ _SIZE_ERROR = 1.0  # of those, before
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
-_MUCH = np.array([0.15, 0.15, 0.02])  # of attenuation, blur, taper: changes from which derivatives by them are taken anew
+_CURVE_ERROR, _TAIL_ERROR = (0.4, 0.05), 0.07
+_MUCH = np.array(
+    [0.15, 0.15, 0.02, 0.1, 0.1, 0.1]
+)  # of attenuation, blur, taper, curve, tail: changes from which derivatives by them are taken anew
+_MOST = 1.6, 0.8, 0.6  # curve and tail
 _MOST_BY_STEP = 0.6  # of all these
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
@@ -79,7 +83,7 @@ def fit_shared(
     parallel = parallel and len(needles[0].angles) > 1
     sets = clusters(needles)
     windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
-    before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, _SIZE_ERROR, _SIZE_ERROR]
+    before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, _SIZE_ERROR, _SIZE_ERROR]
     precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     moved = np.zeros(len(precision))
     start, taper = optics, needles[0].shape.taper
@@ -166,8 +170,12 @@ def _sizes(systems: list[Equations], sets: list[list[NeedleFit]]) -> _Sizes:
 
 
 def _moved_optics(start: Optics, by: Float) -> Optics:
-    """Optics with these changes of the logarithms of attenuation and blur."""
-    return replace(start, mu_px=start.mu_px * float(np.exp(by[0])), sigma_px=start.sigma_px * float(np.exp(by[1])))
+    """Optics with these changes of the logarithms of attenuation and blur, of curve and tail."""
+    bow, skewed, tail = (
+        between(was + step, -most, most) for was, step, most in zip((*start.curve, start.tail), by[3:], _MOST, strict=False)
+    )
+    dense, blurred = np.exp(by[:2]).tolist()
+    return replace(start, mu_px=start.mu_px * dense, sigma_px=start.sigma_px * blurred, curve=(bow, skewed), tail=tail)
 
 
 def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> list[NeedleFit]:

@@ -12,6 +12,7 @@ from rsa_vision.detect.balls import BallFits
 from rsa_vision.detect.decide import EDGE
 from rsa_vision.detect.find import CHANCE, DOUBTFUL, MISFIT, misfit
 from rsa_vision.detect.needle_images import NeedleFit
+from rsa_vision.detect.needles import excess_of, significant_misfit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.optics import CAP
 from rsa_vision.detect.profiles import Optics
@@ -81,7 +82,7 @@ def table_of(
     covariance = np.concatenate(
         [
             balls.covariance[:, :2, :2] * excess[:, None, None],
-            np.array([t.covariance_px2 * _excess(t, noise) for t in tees]).reshape(-1, 2, 2),
+            np.array([t.covariance_px2 * excess_of(t, noise) for t in tees]).reshape(-1, 2, 2),
         ]
     )
     radius = np.concatenate([balls.radius_px, [t.shape.half_width_px for t in tees]])
@@ -95,7 +96,7 @@ def table_of(
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
-    poor = np.concatenate([poor_ball, np.array([_significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
+    poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it
     covariance[poor] += (_SOMEWHERE * radius[poor] ** 2)[:, None, None] * np.eye(2)
@@ -111,12 +112,3 @@ def table_of(
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
     trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(snr, CAP))
-
-
-def _excess(fit: NeedleFit, noise: NoiseModel) -> float:
-    """Chi2 under a needle where it is more than chance makes it."""
-    return fit.chi2_core if fit.chi2_core > 1 + CHANCE * noise.scatter(np.array(fit.n_core)) else 1.0
-
-
-def _significant_misfit(fit: NeedleFit, noise: NoiseModel) -> float:
-    return fit.misfit if _excess(fit, noise) > 1.0 else 0.0

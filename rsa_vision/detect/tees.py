@@ -80,7 +80,7 @@ def find_tees(
 
     tees = split_twins(film, tees, optics, noise, is_tee, beside)
     if optics.rough:
-        optics, _ = common_optics(film, tees, optics, noise)  # where arms cross hardly depends on where they end
+        optics = common_optics(film, tees, optics, noise)  # where arms cross hardly depends on where they end
         tees = fit_all(film, tees, optics, noise)
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
