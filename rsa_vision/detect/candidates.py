@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.junctions import find_junctions
 from rsa_vision.detect.noise import NoiseModel, medians
-from rsa_vision.detect.strokes import COLUMNS, find_strokes
+from rsa_vision.detect.strokes import COLUMNS, find_strokes, where_three_meet
 from rsa_vision.types import Float, Int
 
 BAND = 1024  # rows at full resolution that are in memory as float32 at once
@@ -98,7 +98,9 @@ def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> 
     table = table[np.argsort(-np.abs(table[:, 3]))]
     strokes_found = np.concatenate(strokes)
     strokes_found = strokes_found[np.argsort(-np.abs(strokes_found[:, 5]))]
-    return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], np.concatenate(junctions), strokes_found)
+    joined = np.concatenate(junctions)
+    joined = np.concatenate([joined, where_three_meet(strokes_found, joined)])
+    return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], joined, strokes_found)
 
 
 def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work: NDArray[np.float32]) -> tuple[Float, Float, Float]:

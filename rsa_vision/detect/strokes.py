@@ -19,6 +19,10 @@ SLIM = 1.5  # ratio of an island's length to its width
 LENGTHS_PX = (4.0, 130.0)  # film pixels; needles and wires are longer
 COLUMNS = 6
 _ALONG, _ASIDE_PX = (0.3, 1.6), 4.0  # of its length, from its middle; or by its width: where the tip of an arm is
+_MOST_ARMS = 200  # of each polarity
+_STRAIGHT, _ALIKE = 0.95, 0.6  # cosine between the halves of a bar; logarithm of the lengths of strokes
+_REACH, _OFF = (0.4, 2.5), 0.15  # from tip to the middle of a stroke, over its length; errors of places, over that
+_RING = 0.85  # of that: where rings around tips meet arms
 _LEAST_AREA = 4  # pixels of the answer
 
 
@@ -71,6 +75,49 @@ def at_junctions(strokes: Float, junctions: Float) -> Bool:
     along, across = np.abs(dx * c + dy * s) / length, np.abs(dy * c - dx * s)
     on = (along > _ALONG[0]) & (along < _ALONG[1]) & (across < np.maximum(width, _ASIDE_PX))
     return np.asarray((on & (np.sign(junctions[:, 4]) == np.sign(strength))).any(axis=1))
+
+
+def where_three_meet(strokes: Float, junctions: Float) -> Float:
+    """Find where three strokes point at one place in the shape of a T: tees whose arms fade out far before the tip.
+
+    Parameters
+    ----------
+    strokes : ndarray of shape (n, 6)
+        Strongest first; that many of a film are looked at.
+    junctions : ndarray of shape (m, 5)
+        Known ones.
+
+    Returns
+    -------
+    ndarray of shape (k, 5)
+        As ``junctions``, none of them.
+    """
+    found = [np.zeros((0, 5))]
+    for sign in (1, -1):
+        col, row, angle, length, _, strength = strokes[np.sign(strokes[:, 5]) == sign][:_MOST_ARMS].T
+        at, way = np.stack([col, row], axis=1), np.stack([np.cos(angle), -np.sin(angle)], axis=1)
+        # both halves of the bar: opposite ways, each away from the other's thin end
+        apart = at[:, None] - at
+        reach = np.einsum("ijk,ik->ij", apart, way) / 2
+        aside = np.abs(apart[:, :, 0] * way[:, None, 1] - apart[:, :, 1] * way[:, None, 0])
+        alike = np.abs(np.log(length[:, None] / length)) < _ALIKE
+        near = (reach > _REACH[0] * length[:, None]) & (reach < _REACH[1] * length[:, None])
+        i, j = np.nonzero((way @ way.T < -_STRAIGHT) & near & alike & (aside < _OFF * 2 * reach))
+        middle, reach = (at[i] + at[j]) / 2, reach[i, j]
+        # the stem: as far from the middle, square to the bar
+        away = (at - middle[:, None]) / reach[:, None, None]
+        square = np.abs(np.einsum("pks,ps->pk", away, way[i])) < 2 * _OFF
+        outward = np.abs(np.einsum("pks,ks->pk", away, way) - 1) < 2 * _OFF
+        pair, stem = np.nonzero(
+            square & outward & (np.abs(way[i] @ way.T) < 2 * _OFF) & (np.abs(np.log(length[i, None] / length)) < _ALIKE)
+        )
+        least = np.minimum(np.abs(strength[stem]), np.minimum(np.abs(strength[i]), np.abs(strength[j]))[pair])
+        found.append(np.column_stack([middle[pair], angle[stem], _RING * reach[pair], sign * least]))
+    table, kept = np.concatenate(found), junctions
+    for place in table[np.argsort(-np.abs(table[:, 4]))]:
+        if (np.hypot(*(kept[:, :2] - place[:2]).T) > _RING * place[3]).all():
+            kept = np.vstack([kept, place])
+    return kept[len(junctions) :]
 
 
 def _one_polarity(r: Int, c: Int, weight: Float, over: Float, level: int, sign: int) -> Float:
