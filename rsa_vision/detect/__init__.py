@@ -20,7 +20,7 @@ from rsa_vision.detect.find import MISFIT, STRENGTH, fit_at, plausible, signific
 from rsa_vision.detect.leftover import noise_under
 from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needle_images import NeedleFit
-from rsa_vision.detect.needle_sets import on_arms
+from rsa_vision.detect.needle_sets import is_located, on_arms
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import MOST_STROKES, find_pins, look_for_pins
@@ -130,6 +130,7 @@ def _one_polarity(
     more_pins = look_for_pins(film, candidates.strokes[~on_arms(candidates.strokes[:, :2], tees)], noise)
     seeds = off_pins(seeds, more_pins)
     pins, pin_optics = find_pins(film, [p for p in rough_pins + more_pins if np.sign(p.depth) == sign], tees, optics, noise)
+    pins = [p for p in pins if is_located(p)]
 
     needles = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
 

@@ -84,6 +84,11 @@ def _images(near: list[NeedleFit], optics: Optics) -> Images | None:
     return images
 
 
+def is_located(needle: NeedleFit) -> bool:
+    """Say whether the tip is known better than the needle is wide: the rim of something large is as long as one likes and marks nothing."""
+    return bool(np.linalg.eigvalsh(needle.covariance_px2)[-1] < (2 * needle.shape.half_width_px) ** 2)
+
+
 def on_arms(places: Float, needles: list[NeedleFit]) -> Bool:
     """Say which places (n, 2) lie on an arm of a needle."""
     return np.asarray(np.any([np.zeros(len(places), bool), *(_on_arm(places, needle) for needle in needles)], axis=0))

@@ -1,7 +1,8 @@
 """Balls that a first look missed: where the film's balls are known, one like them is looked for at every candidate left over.
 
 A first look starts from the size that the filter suits and from guessed optics. Beside an edge, or faint on bone, it grows until it holds
-the bone as well; started from the usual size it stays with the ball. Then balls on lines as strong as they are, and under scratches.
+the bone as well; started from the usual size it stays with the ball. Then balls on lines as strong as they are, half out of implants, and
+under scratches.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ _CLEAR = 0.9  # of the limit, over clutter
 _FAR, _SLACK = 1.5, 1.4  # times the limit, times the misfit that is tolerated otherwise
 _ROUND = 0.4  # the filter that suits the usual size answers balls of it by round extrema
 _SIZE = 1.6  # ratio of the fitted radius to the usual one
-_ROUGH = 4.0  # times the misfit that is tolerated otherwise, before they are masked
+_ROUGH = 4.0  # times the misfit that is tolerated otherwise, before rims are fitted too or scratches masked
+_DEEP = 0.4  # of the depth of clear balls: half of one is seen against what is beside the rim; threads of screws are shallower
 _OF_SIZE = 1.25  # the same to that of any clear ball, where lines and scratches are what is seen first
 
 
@@ -88,10 +90,12 @@ def look_again(
     known = join([balls, fits])
     # a line takes the most part of what is there, and the rest has to be sure: faint places are not worth it
     over = _over_lines(look, place[strong], known)
-    crossed = _under_scratches(look, rough, join([known, over]))
-    count = [len(fits.depth), len(over.depth), len(crossed.depth)]
+    at_rims = _at_rims(look, rough, join([known, over]))
+    with_edge = join([over, at_rims])
+    crossed = _under_scratches(look, rough, join([known, with_edge]))
+    count = [len(fits.depth), len(with_edge.depth), len(crossed.depth)]
     at_edges = np.concatenate([edged, np.repeat([True, False], count[1:])])
-    return join([fits, over, crossed]), at_edges, np.repeat([False, False, True], count)
+    return join([fits, with_edge, crossed]), at_edges, np.repeat([False, False, True], count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +126,7 @@ class _Look:
 
 
 def _of_the_usual_size(look: _Look, place: Float, balls: BallFits) -> tuple[BallFits, Bool, BallFits]:
-    """Balls at these places, those of them with an edge, and what is sure but leaves too much for a ball."""
+    """Balls at these places, those of them with an edge, and what is sure at first, though it may leave too much for a ball."""
     film, usual, limit, optics, noise, needles = look.film, look.usual, look.limit, look.optics, look.noise, look.needles
 
     def others(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
@@ -134,7 +138,7 @@ def _of_the_usual_size(look: _Look, place: Float, balls: BallFits) -> tuple[Ball
 
     fits, stays = fit(place, quick=True)
     sure = in_correlated_noise(fits, optics.sigma_px, noise) > max(SURE, limit)
-    rough = fits.rows(stays & sure & plausible(fits, noise, _ROUGH) & ~plausible(fits, noise))
+    rough = fits.rows(stays & sure & plausible(fits, noise, _ROUGH))  # a longer fit may slip into what is beside it
     enough = promising(fits, limit, optics.sigma_px, noise)
     fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
     fits, stays = fit(fits.position_px, quick=False)
@@ -155,9 +159,18 @@ def _over_lines(look: _Look, place: Float, known: BallFits) -> BallFits:
     return fits.rows(edged & look.sure(fits, known))
 
 
+def _at_rims(look: _Look, rough: BallFits, known: BallFits) -> BallFits:
+    """Balls half out of something as dense as they are: of its rim a surface leaves so much that only a fit with the edge can tell."""
+    rough = distinct(rough.rows(~_near(rough.position_px, known, look.usual)), look.noise)
+    fits, edged = beside_edges(look.film, rough, look.optics, look.noise, look.beside(known))
+    clear = np.abs(known.depth[look_clear(known, look.noise)])
+    deep = np.abs(fits.depth) > _DEEP * np.median(clear) if len(clear) else np.zeros(len(fits.depth), bool)
+    return distinct(fits.rows(edged & deep & look.may_be(fits, known) & look.sure(fits, known)), look.noise)
+
+
 def _under_scratches(look: _Look, rough: BallFits, known: BallFits) -> BallFits:
     """Balls that are described well once what crosses them is masked."""
-    rough = distinct(rough.rows(~_near(rough.position_px, known, look.usual)), look.noise)
+    rough = distinct(rough.rows(~plausible(rough, look.noise) & ~_near(rough.position_px, known, look.usual)), look.noise)
     fits = without_scratches(look.film, rough, look.optics, look.noise, look.beside(known))
     return distinct(fits.rows(look.may_be(fits, known) & look.sure(fits, known)), look.noise)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.covered import find_covered
-from rsa_vision.detect.crossing import fit_crossing, moved
+from rsa_vision.detect.crossing import chi2_of, fit_crossing, moved, window_of
 from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.junctions import RINGS_PX
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
@@ -37,6 +37,7 @@ _ACROSS = 1.5  # of the length of a tee, less what its image is wider by blur: a
 _TOUCHING = 1.05  # of the lengths of two tees, by which tips are apart whose arms reach each other; ends are blurred
 _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
+_ASKED = 3  # cleanest tees that tell blur and taper
 _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
 
@@ -103,7 +104,7 @@ def _apart(rough: list[NeedleFit], known: list[NeedleFit], gap_px: float) -> lis
 
 
 def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> Optics:
-    """Estimate the blur from the strongest junctions, for films without balls.
+    """Estimate the blur from the cleanest tees at junctions, for films without balls.
 
     Parameters
     ----------
@@ -115,14 +116,19 @@ def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> O
     -------
     Optics
     """
-    strongest = junctions[np.argsort(-np.abs(junctions[:, 4]))][:ENOUGH]
+    strongest = junctions[np.argsort(-np.abs(junctions[:, 4]))][:_MOST_JUNCTIONS]
+    # the very strongest are where arms cross, and of what is no tee the widest blur leaves least
+    cleanest = _at_junctions(film, strongest, TAPERS[0], Optics(COARSE_SIGMA_PX, COARSE_MU_PX), noise)[:_ASKED]
 
-    def left(sigma_px: float) -> float:
-        return _mean_misfit(_at_junctions(film, strongest, TAPERS[0], Optics(sigma_px, COARSE_MU_PX), noise))
-
-    costs = {sigma: left(sigma) for sigma in _BLURS_PX}
-    best = min(costs, key=lambda sigma: costs[sigma])
-    return Optics(best if np.isfinite(costs[best]) else COARSE_SIGMA_PX, COARSE_MU_PX, rough=True)
+    windows = [window_of(film, [f], Optics(_BLURS_PX[-1], COARSE_MU_PX), noise, None) for f in cleanest]
+    fits, left = {}, {}
+    for sigma in _BLURS_PX:
+        optics = Optics(sigma, COARSE_MU_PX)
+        fits[sigma] = [fit_needles(film, f.position_px, f.angles, f.shape, optics, noise) for f in cleanest]
+        left[sigma] = sum(chi2_of(window, f, optics, noise) for window, f in zip(windows, fits[sigma], strict=True))
+    best = min(left, key=lambda sigma: left[sigma])
+    known = any(is_tee(f, slack=_BEFORE) for f in fits[best])
+    return Optics(best if known else COARSE_SIGMA_PX, COARSE_MU_PX, rough=True)
 
 
 def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
@@ -173,7 +179,7 @@ def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Op
 
 def _mean_misfit(fits: list[NeedleFit]) -> float:
     """Mean over the best few of what the model leaves; infinite for none."""
-    return float(np.mean([f.misfit + 1 - f.explained for f in fits[:3]])) if fits else np.inf
+    return float(np.mean([f.misfit + 1 - f.explained for f in fits[:_ASKED]])) if fits else np.inf
 
 
 def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from rsa_vision.detect import tees
+from rsa_vision.detect.candidates import find_candidates
+from rsa_vision.detect.find import STRENGTH
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.noise import estimate_noise
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.tees import find_tees, is_tee
+from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
+
+from .test_covered import SIGMA_PX, exposed, light_past_tees, tips_of
 
 
 def test_arms_of_a_few_pixels_are_no_tee() -> None:
@@ -36,3 +40,19 @@ def test_nothing_left_of_what_looked_like_tees_is_no_error(monkeypatch: pytest.M
     monkeypatch.setattr(tees, "_like", lambda *_: [])
     optics = Optics(1.0, 0.5)
     assert find_tees(film, np.zeros((1, 5)), np.zeros((0, 6)), optics, estimate_noise(film, 16)) == ([], [], optics)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blur_comes_from_clean_tees_where_crossing_arms_look_stronger(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    clean, crossed = np.split(tips_of(rng), [4])
+    beside = crossed + np.array([17.0, -20.0]) * rng.choice([-1, 1], (len(crossed), 1))
+    tips = np.concatenate([clean, crossed, beside])
+    film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
+    noise = estimate_noise(film, 16)
+    junctions = find_candidates(film, STRENGTH, noise).junctions
+    gap = np.hypot(*(junctions[:, None, :2] - tips).transpose(2, 0, 1)).min(axis=1)
+    junctions[gap > 6.0, 4] *= 100.0
+    assert np.count_nonzero(gap > 6.0) > 6
+    optics = optics_of_tees(film, junctions, noise)
+    assert 0.8 < optics.sigma_px / np.hypot(SIGMA_PX, np.sqrt(1 / 12)) < 1.25
