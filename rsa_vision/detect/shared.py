@@ -40,7 +40,7 @@ _CURVE_ERROR, _TAIL_ERROR = (0.4, 0.05), 0.07
 _MUCH = np.array(
     [0.15, 0.15, 0.02, 0.1, 0.1, 0.1]
 )  # of attenuation, blur, taper, curve, tail: changes from which derivatives by them are taken anew
-_MOST = 1.6, 0.8, 0.6  # curve and tail
+_MOST = 0.8, 0.5, 0.6  # curve and tail
 _MOST_BY_STEP = 0.6  # of all these
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
@@ -85,6 +85,8 @@ def fit_shared(
     windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
     before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, _SIZE_ERROR, _SIZE_ERROR]
     precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
+    # steps weigh pixels as if noise were white, and believe them the more the more neighbours share of it
+    held = precision * float(noise.gain(np.hypot(optics.sigma_px, np.median([f.shape.half_width_px for f in needles]))))
     moved = np.zeros(len(precision))
     start, taper = optics, needles[0].shape.taper
     slopes: list[list[Float]] = []
@@ -101,10 +103,10 @@ def fit_shared(
         ]
         last = [*systems]
         told = [e.information() for e in systems]
-        normal = precision + sum(matrix for matrix, _ in told)
+        normal = held + sum(matrix for matrix, _ in told)
         if step == steps or converged:
             break
-        change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
+        change = _step(normal, sum(target for _, target in told) - held @ moved, taper)
         if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
             change[:OPTICS] = 0.0  # new tables for so little are not worth their time
         far = float(change @ normal @ change) / len(change)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits
+from rsa_vision.detect.balls import RADIUS_PX, BallFits
 from rsa_vision.detect.decide import EDGE
 from rsa_vision.detect.find import CHANCE, DOUBTFUL, MISFIT, misfit
 from rsa_vision.detect.needle_images import NeedleFit
@@ -32,7 +32,8 @@ def what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Floa
     """Return the misfit of each ball, and which are not described well."""
     under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
     left = misfit(under, noise, CHANCE)
-    return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE)
+    specks = balls.radius_px <= RADIUS_PX[0]  # as small as a fit may be: how small they are is not known, nor what they are
+    return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE) | specks
 
 
 def table_of(
