@@ -31,7 +31,7 @@ def in_one_thread(work: Callable[Given, Result]) -> Callable[Given, Result]:
 def _libraries() -> ThreadpoolController:
     """To look for those that are loaded takes milliseconds, to limit them microseconds."""
     import cv2  # noqa: F401  # each brings its own
-    import scipy.linalg  # noqa: F401
+    import scipy.linalg  # noqa: F401  # as above
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
