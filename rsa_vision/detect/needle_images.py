@@ -135,14 +135,16 @@ def _opacity(
     if optics.tail:
         seen += optics.tail * (blurred(TAIL * blurrier * optics.sigma_px) - seen)
     if any(optics.curve):
-        seen += np.tensordot(optics.curve, of_curve(seen), axes=1)
+        seen = film_curve(seen, optics.curve)[0]
     return seen if skew else np.concatenate([seen[:, :0:-1], seen], axis=1)
 
 
-def of_curve(opacity: Float) -> Float:
-    """What the coefficients of :attr:`Optics.curve` belong to, on a new first axis."""
-    bow = opacity * (1 - opacity)
-    return np.stack([bow, bow * (1 - 2 * opacity)])
+def film_curve(opacity: Float, curve: tuple[float, float]) -> Float:
+    """What film shows of blurred opacities, and its derivatives by the two coefficients of :attr:`Optics.curve`: on a new first axis."""
+    shifted = opacity / (opacity + math.exp(-curve[0]) * (1 - opacity))
+    bow = shifted * (1 - shifted)
+    skewed = bow * (1 - 2 * shifted)
+    return np.stack([shifted + curve[1] * skewed, bow * (1 + curve[1] * (1 - 6 * bow)), skewed])
 
 
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
@@ -188,7 +190,7 @@ def _table(half_width: float, length: float, taper: float, optics: Optics, slant
         wide, short = _opacity(*one, blurrier=factor), _opacity(half_width, length, taper - STEP, optics, slant)
         straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0)), slant)
         spread = _opacity(half_width, length, taper, replace(optics, tail=optics.tail + STEP), slant)
-        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *of_curve(straight), (spread - base) / STEP]
+        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *film_curve(straight, optics.curve)[1:], (spread - base) / STEP]
     table = np.array(nodes, np.float32)
     table[:, [0, -1]] = table[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return table

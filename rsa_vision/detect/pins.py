@@ -33,7 +33,8 @@ _RATHER_THAN_ROD, _RATHER_THAN_TURNED = 2.5, 7.0
 _ROD = 0.02  # taper of a rod: blunt
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
-_OF_CURVE, _OF_TAIL, _OF_MISFIT = 0.03, 0.03, 2.0  # errors along a pin over its length, by the fourth power of the first and by the others
+# errors along a pin over its length, by the fourth power of the curve, by it and the logarithm of the depth, by the others
+_OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.02, 0.05, 0.03, 2.0
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
 _OF_A_KIND = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
 _SAMPLE = 6
@@ -122,7 +123,8 @@ def find_pins(
     pins = _pointed(film, _distinct([f for f in pins if is_pin(f)]), optics, noise)
     pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
-    return [_less_sure_along(f, optics, noise) for f in pins if is_pin(f)], optics
+    typical = float(np.median([f.depth for f in pins])) if pins else 0.0
+    return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f)], optics
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
@@ -252,13 +254,15 @@ def _proportion(pins: list[NeedleFit]) -> float:
     return float((b @ d + 0.5 * ratio / slack**2) / (b @ b + 1 / slack**2))
 
 
-def _less_sure_along(fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
+def _less_sure_along(fit: NeedleFit, typical: float, optics: Optics, noise: NoiseModel) -> NeedleFit:
     """Add an error along the pin: of film curve and blur as far as their models go, of what else lies there, of a point that is no cone.
 
-    Across the pin there is nothing that they could move.
+    ``typical`` is the depth of the film's pins. Across the pin there is nothing that these could move.
     """
     by_rest = _OF_MISFIT * significant_misfit(fit, noise) / np.sqrt(excess_of(fit, noise))  # by that the table widens all of it
-    by_model = np.array([_OF_CURVE * optics.curve[0] ** 4, _OF_TAIL * optics.tail, by_rest])
+    # where film responds more or less than usual, it is bent more or less as well
+    unlike = abs(math.log(fit.depth / typical))
+    by_model = np.array([_OF_CURVE * optics.curve[0] ** 4, _OF_UNLIKE * optics.curve[0] * unlike, _OF_TAIL * optics.tail, by_rest])
     parts = [_POINT * fit.shape.half_width_px, *(fit.shape.length_px * by_model)]
     error_px = float(np.linalg.norm(parts))
     way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])

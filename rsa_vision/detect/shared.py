@@ -36,10 +36,10 @@ _SIZE_ERROR = 1.0  # of those, before
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
-_CURVE_ERROR, _TAIL_ERROR = (0.4, 0.05), 0.07
+_CURVE_ERROR, _TAIL_ERROR = (0.6, 0.1), 0.07
 # of attenuation, blur, taper, curve, tail: changes from which derivatives by them are taken anew
 _MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1])
-_MOST = 0.8, 0.5, 0.6  # curve and tail; a curve of -1 would hide all tips
+_MOST = 3.0, 0.8, 0.6  # curve and tail
 _MOST_BY_STEP = 0.6  # of all these
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
