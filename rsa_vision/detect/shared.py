@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.alike import true_spread
 from rsa_vision.detect.crossing import Window, window_of
+from rsa_vision.detect.grounds import errors_by_ground
 from rsa_vision.detect.leftover import LEAST, at_rims, usual_square
 from rsa_vision.detect.needle_equations import OF_SLANTS, OPTICS, SHARED, SLANT, Equations, by_optics, linearise
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
@@ -136,6 +137,10 @@ def fit_shared(
     out = []
     for window, e, members, scatter in zip(windows, systems, sets, by_noise, strict=True):
         out += _finished(window, e, members, under * scatter, errors, noise, converged)
+    if alike:
+        tips = [scatter[: len(e.tips), : len(e.tips)] for scatter, e in zip(by_noise, systems, strict=True)]
+        by_ground = np.concatenate(errors_by_ground(film, windows, systems, tips, noise))
+        out = [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, by_ground, strict=True)]
     return out, optics
 
 
