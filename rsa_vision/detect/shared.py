@@ -41,7 +41,8 @@ _CURVE_ERROR, _TAIL_ERROR = (0.6, 0.1), 0.07
 # of attenuation, blur, taper, curve, tail: changes from which derivatives by them are taken anew
 _MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1])
 _MOST = 3.0, 0.8, 0.6  # curve and tail
-_MOST_BY_STEP = 0.6  # of all these
+_MOST_BY_STEP, _MOST_TAPER_BY_STEP = 0.6, 0.2  # of all these
+_SHORTER = 3  # attempts at a step that loses nothing
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
 
@@ -93,7 +94,7 @@ def fit_shared(
     since = np.full(OPTICS, np.inf)
     sizes = _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     last: list[Equations | None] = [None] * len(sets)
-    converged = False
+    converged, shorter, least = False, 0, np.inf
     for step in range(steps + 1):
         if (np.abs(moved[:OPTICS] - since) > _MUCH).any():
             slopes, since = [by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:OPTICS].copy()
@@ -102,26 +103,34 @@ def fit_shared(
             for w, m, k, spread, before in zip(windows, sets, slopes, sizes.spread, last, strict=True)
         ]
         last = [*systems]
-        told = [e.information() for e in systems]
-        normal = held + sum(matrix for matrix, _ in told)
-        if step == steps or converged:
-            break
-        change = _step(normal, sum(target for _, target in told) - held @ moved, taper)
-        if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
-            change[:OPTICS] = 0.0  # new tables for so little are not worth their time
-        far = float(change @ normal @ change) / len(change)
-        moves = [e.step(change) for e in systems]
-        surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, moves, strict=True)])
-        converged = step > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
-        if converged and not alike:
-            break  # from so near the last step gets there as well; that to the sizes of all is longer
-        moved += change
+        cost = sum(e.cost for e in systems) + float(moved @ held @ moved)
+        if cost > least + len(moved) and shorter < _SHORTER and step < steps:
+            # far from a straight line: back, and not as far
+            (moved, taper, sets, sizes, systems), shorter = was, shorter + 1
+            change, moves, converged = change / 3, [own / 3 for own in moves], False
+        else:
+            told = [e.information() for e in systems]
+            normal = held + sum(matrix for matrix, _ in told)
+            if step == steps or converged:
+                break
+            least, shorter = cost, 0
+            change = _step(normal, sum(target for _, target in told) - held @ moved, taper)
+            if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
+                change[:OPTICS] = 0.0  # new tables for so little are not worth their time
+            far = float(change @ normal @ change) / len(change)
+            moves = [e.step(change) for e in systems]
+            surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, moves, strict=True)])
+            converged = step > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
+            if converged and not alike:
+                break  # from so near the last step gets there as well; that to the sizes of all is longer
+            was = moved, taper, sets, sizes, systems
+        moved = moved + change
         taper += change[2]
         optics = _moved_optics(start, moved)
         sets = [_moved(e.members, own, change, taper, parallel) for e, own in zip(systems, moves, strict=True)]
         sizes = replace(sizes, typical=sizes.typical + change[OPTICS:SHARED])
         if alike and step + 1 == _SIZES_AFTER:
-            sizes, converged = _sizes(systems, sets), False
+            sizes, converged, least = _sizes(systems, sets), False, np.inf
     systems = [e.in_white_noise(w, noise) for e, w in zip(systems, windows, strict=True)]
     told = [e.information() for e in systems]
     normal = precision + sum(matrix for matrix, _ in told)
@@ -147,14 +156,19 @@ def fit_shared(
 def _step(normal: Float, target: Float, taper: float) -> Float:
     """Change of the common parameters, not too far at once; the taper stays within its bounds, the others follow."""
     change = np.linalg.solve(normal, target).astype(np.float64)
-    change *= min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9))
+    change *= _as_far(change)
     held = between(change[2], _LEAST_TAPER - taper, 1.0 - taper)
     if held != change[2]:
         others = np.arange(len(change)) != 2
         change[others] = np.linalg.solve(normal[np.ix_(others, others)], target[others] - normal[others, 2] * held)
-        change[others] *= min(1.0, _MOST_BY_STEP / max(float(np.abs(change[others]).max()), 1e-9))
         change[2] = held
+        change *= _as_far(change)
     return change
+
+
+def _as_far(change: Float) -> float:
+    """Part of a change that one step may go."""
+    return float(min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9), _MOST_TAPER_BY_STEP / max(abs(change[2]), 1e-9)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
