@@ -34,7 +34,7 @@ _ROD = 0.02  # taper of a rod: blunt
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length, by the fourth power of the curve, by it and the logarithm of the depth, by the others
-_OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.02, 0.05, 0.03, 2.0
+_OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.01, 0.05, 0.03, 2.0
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
 _OF_A_KIND = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
 _SAMPLE = 6
