@@ -120,7 +120,7 @@ def resolve_balls(
     balls = plausible(found, noise)
     alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
     perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
-    found = found.rows(~_in_one_beam(found) | (misfit(found, noise) < DOUBTFUL * MISFIT))  # two explain much: they must explain it well
+    found = found.rows(~_bar(found, misfit(found, noise) < DOUBTFUL * MISFIT))
     found = resolve_crowds(film, candidates, distinct(found, noise), optics, noise, tees)
     found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
     found = without_lines(film, distinct(found, noise), limit, optics, noise, tees)
@@ -162,6 +162,12 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
 def _in_one_beam(fits: BallFits) -> Bool:
     """Say whose shadow lies over that of another ball."""
     return np.asarray((lapping_balls(fits) & ~np.eye(len(fits.depth), dtype=bool)).any(axis=1))
+
+
+def _bar(fits: BallFits, close: Bool) -> Bool:
+    """Say which of those in one beam are no balls: two explain much, so they must explain it closely; between two that do not is a bar."""
+    partners = lapping_balls(fits) & ~np.eye(len(fits.depth), dtype=bool)
+    return np.asarray((partners.any(axis=1) & ~close) | ((partners & ~close).sum(axis=1) > 1))
 
 
 def _cancelled(fits: BallFits) -> Bool:

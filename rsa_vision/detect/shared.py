@@ -40,6 +40,7 @@ _SETTLED = 0.1  # conditional standard deviations of all that is common
 _CURVE_ERROR, _TAIL_ERROR = (0.6, 0.1), 0.07
 # of attenuation, blur, taper, curve, tail: changes from which derivatives by them are taken anew
 _MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1])
+_NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1])  # changes of those with which the last step gets there
 _MOST = 3.0, 0.8, 0.6  # curve and tail
 _MOST_BY_STEP, _MOST_TAPER_BY_STEP = 0.6, 0.2  # of all these
 _SHORTER = 3  # attempts at a step that loses nothing
@@ -121,6 +122,7 @@ def fit_shared(
             moves = [e.step(change) for e in systems]
             surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, moves, strict=True)])
             converged = step > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
+            converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
             if converged and not alike:
                 break  # from so near the last step gets there as well; that to the sizes of all is longer
             was = moved, taper, sets, sizes, systems

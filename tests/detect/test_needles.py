@@ -1,11 +1,15 @@
 """The image of a needle: as exact chords make it, thick ends seen at a slant included."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.optimize import least_squares
 
-from rsa_vision.detect.needle_images import NeedleShape, arm_images
+from rsa_vision.detect.needle_images import NeedleShape, arm_images, film_curve
 from rsa_vision.detect.profiles import Optics
+from rsa_vision.types import Float
 from synthetic.chords import chord_pin
 
 HALF, FINE, SIGMA, MU, TURN = 36, 7, 1.1, 0.6, 0.4
@@ -41,3 +45,33 @@ def test_tables_are_the_image_of_a_cone_at_any_slant(along: float, across: float
     assert np.sqrt(((ours - image) ** 2).sum() / (image**2).sum()) < 0.025
     if along > 0.2:
         assert np.abs(modelled(0.0, 0.0, across) - image).max() > 2 * np.abs(ours - image).max()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        pytest.param(lambda light: -np.log(light), id="logarithm"),
+        pytest.param(lambda light: light**-2.0, id="transmitted light"),
+        pytest.param(lambda light: -1 / (1 + (0.6 / light) ** 2), id="density with toe and shoulder"),
+    ],
+)
+@pytest.mark.parametrize("scattered", [0.5, 1.0])
+def test_the_film_curve_follows_those_of_films(answer: Callable[[Float], Float], scattered: float) -> None:
+    opacity = np.linspace(0.0, 0.95, 50)
+    shown = answer((1 + scattered - opacity) / (1 + scattered))
+    shown = (shown - shown[0]) / np.ptp(shown)
+
+    def left(of: Float) -> Float:
+        return of[0] * film_curve(opacity, (of[1], of[2]))[0] - shown
+
+    best = least_squares(left, [1.0, 0.0, 0.0])
+    assert np.sqrt(np.mean(best.fun**2)) < 0.004
+    assert abs(best.x[2]) < 0.4  # a small correction
+
+
+def test_derivatives_of_the_film_curve() -> None:
+    opacity, step = np.linspace(0.0, 1.0, 21), 1e-5
+    _, *slopes = film_curve(opacity, (-0.8, 0.2))
+    for slope, by in zip(slopes, (np.array([step, 0]), np.array([0, step])), strict=True):
+        high, low = (film_curve(opacity, tuple(np.array([-0.8, 0.2]) + sign * by))[0] for sign in (1, -1))
+        np.testing.assert_allclose(slope, (high - low) / (2 * step), atol=1e-8)

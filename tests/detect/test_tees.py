@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect import tees
+from rsa_vision.detect import detect_markers, tees
 from rsa_vision.detect.candidates import find_candidates
 from rsa_vision.detect.find import STRENGTH
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
@@ -15,7 +16,7 @@ from rsa_vision.detect.noise import estimate_noise
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 
-from .test_covered import SIGMA_PX, exposed, light_past_tees, tips_of
+from .test_covered import SIGMA_PX, check, exposed, light_past_tees, tips_of
 
 
 def test_arms_of_a_few_pixels_are_no_tee() -> None:
@@ -56,3 +57,16 @@ def test_blur_comes_from_clean_tees_where_crossing_arms_look_stronger(seed: int)
     assert np.count_nonzero(gap > 6.0) > 6
     optics = optics_of_tees(film, junctions, noise)
     assert 0.8 < optics.sigma_px / np.hypot(SIGMA_PX, np.sqrt(1 / 12)) < 1.25
+
+
+@pytest.mark.parametrize("sigma_px", [1.0, 1.3, 1.5])
+def test_bright_tees_in_transmitted_light(sigma_px: float) -> None:
+    """A curve so bent that steps of the common fit went astray, all tees with them."""
+    rng = np.random.default_rng(8)
+    tips = tips_of(rng)
+    exposure = 0.8 * (1 - 0.9 * (1 - gaussian_filter(light_past_tees(tips, np.ones(len(tips))), sigma_px)))
+    light = 10 ** -(3.0 / (1 + (0.7 / exposure) ** 2.2))
+    film = 65535 * (light + np.ptp(light) / 20 * rng.standard_normal(light.shape) + 0.1)
+    found = detect_markers(np.clip(np.rint(film), 0, 65535).astype(np.uint16), bits=16).images
+    check(found, tips, list(range(len(tips))))
+    assert (found.flags == 0).all()
