@@ -308,6 +308,15 @@ def main() -> None:
         )
         for shape in ("tee", "pin")
     }
+    bent = run(
+        (
+            ({"shape": s, "response": r, "CNR": c}, Case(s, 2.5, c, companions=True, response=r))
+            for s in ("tee", "pin")
+            for r in ("log", "density", "transmission")
+            for c in ((20.0,) if quick else (50.0, 20.0))
+        ),
+        films,
+    )
     pairs = run(
         (
             ({"apart, diameters": a, "CNR": c}, Case("pair", 4.0, c, apart=a, companions=True, across=6))
@@ -338,6 +347,7 @@ def main() -> None:
         "Quantum noise, and noise that the screen correlates (radius 4 px)": noises,
         "Tees": pins["tee"],
         "Pins": pins["pin"],
+        "Film responses (tees and pins of half width 2.5 px, balls beside)": bent,
         "Neighbours: two balls of radius 4 px side by side": pairs,
         "Films of 4000 x 4750 pixels, one thread": clock,
         **real,

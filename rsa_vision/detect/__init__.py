@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.beside import images_beside, lapping_balls
 from rsa_vision.detect.candidates import Candidates, find_candidates
-from rsa_vision.detect.decide import are_balls
+from rsa_vision.detect.decide import are_balls, faint_beside
 from rsa_vision.detect.find import MISFIT, STRENGTH, fit_at, plausible, significance_limit
 from rsa_vision.detect.leftover import noise_under
 from rsa_vision.detect.mixed import part
@@ -135,12 +135,14 @@ def _one_polarity(
     needles = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
 
     balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needles)
+    high = ~faint_beside(balls, tees + pins, optics.sigma_px, noise)
+    balls, touching, edged, drawn = balls.rows(high), touching[high], edged[high], drawn[high]
     keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching, edged, drawn = balls.rows(keep), touching[keep], edged[keep], drawn[keep]
     more, at_edge, crossed = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needles)
     both = join([balls, more])
     like = are_balls(both, limit, optics.sigma_px, noise)[len(balls.depth) :]
-    like &= (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins)
+    like &= (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins) & ~faint_beside(more, tees + pins, optics.sigma_px, noise)
     balls, edged, added = join([balls, more.rows(like)]), np.append(edged, at_edge[like]), np.zeros(np.count_nonzero(like), bool)
     touching, drawn = np.append(touching, added), np.append(drawn, crossed[like])  # the last fit does not know what was masked either
     for fit in doubtful:

@@ -6,6 +6,7 @@ import numpy as np
 
 from rsa_vision.detect.balls import RADIUS_PX, BallFits
 from rsa_vision.detect.find import EXPLAINED, MISFIT, SURE, misfit
+from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float
 
@@ -13,6 +14,7 @@ ALONE = 10.0  # the same for marks of which there are not enough to tell what th
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
 _LOST = 0.75  # of that, below which a first fit is too low for a mark
+_LOW = 0.25  # quantile of the film's needles that are compared
 UNEXCUSED = 0.5  # those below that have to fit closely
 EDGE = 16.0  # more variance than this around a ball, in units of the noise, is an edge beside it; edges do not look like balls
 SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
@@ -113,6 +115,30 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
     return np.asarray((fits.significance > limit) & alike & (sure | (strength > 0.5 * SURE)))
+
+
+def faint_beside(fits: BallFits, needles: list[NeedleFit], sigma_px: float, noise: NoiseModel) -> Bool:
+    """Say which balls are far fainter than the film's pins and tees, whose metal they share: mottle, on films of hardly any noise.
+
+    Parameters
+    ----------
+    fits : BallFits
+    needles : list of NeedleFit
+    sigma_px : float
+        Blur of the film.
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        In film values and against the noise; none where too few needles tell.
+    """
+    if len(needles) < LEAST_KNOWN:
+        return np.zeros(len(fits.depth), bool)
+    height, background = np.abs([[f.depth, f.background] for f in needles]).T
+    mine, noises = height_of(fits, sigma_px), [np.sqrt(noise.variance_at(at)) for at in (fits.background, background)]
+    low = mine < FAINT * np.quantile(height, _LOW)
+    return np.asarray(low & (mine / noises[0] < FAINT * np.quantile(height / noises[1], _LOW)))
 
 
 def _like_these(known: Bool, fits: BallFits, height: Float) -> Bool:

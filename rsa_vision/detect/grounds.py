@@ -1,4 +1,4 @@
-"""What the film beside pins does to their tips, where it goes on under them: bone and tissue that a quadratic background does not follow."""
+"""What the film beside pins does to their tips, where it goes on under them: bone and tissue that no quadratic background follows."""
 
 from __future__ import annotations
 

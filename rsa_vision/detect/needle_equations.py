@@ -113,7 +113,7 @@ class Equations:
 
     @cached_property
     def cost(self) -> float:
-        """Minus twice the logarithm of the likelihood, but for a constant, were the variance unknown: bone under needles is no noise; priors count."""
+        """Minus twice the logarithm of likelihood and prior, but for a constant, were the variance unknown: bone is no noise."""
         return len(self.residual) * float(np.log(np.mean(self.residual**2))) + float(self.known @ self.known)
 
     @cached_property

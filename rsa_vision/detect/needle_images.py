@@ -190,7 +190,8 @@ def _table(half_width: float, length: float, taper: float, optics: Optics, slant
         wide, short = _opacity(*one, blurrier=factor), _opacity(half_width, length, taper - STEP, optics, slant)
         straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0)), slant)
         spread = _opacity(half_width, length, taper, replace(optics, tail=optics.tail + STEP), slant)
-        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *film_curve(straight, optics.curve)[1:], (spread - base) / STEP]
+        _, *by_curve = film_curve(straight, optics.curve)
+        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *by_curve, (spread - base) / STEP]
     table = np.array(nodes, np.float32)
     table[:, [0, -1]] = table[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return table

@@ -121,12 +121,11 @@ def polarities(
         clear = strength > CLEAR_JUNCTION
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
-        elif balls < _LEAST_EVIDENCE:
-            of_pins, balls = optics_of_pins(
-                film, [p for p in pins + look_for_pins(film, candidates.strokes, noise) if np.sign(p.depth) == sign], noise
-            )
-            if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
-                optics[sign] = of_pins
+        elif balls < max(_LEAST_EVIDENCE, _OF_A_TEE * sum(is_slim(p) and np.sign(p.depth) == sign for p in pins)):
+            rough = [p for p in pins + look_for_pins(film, candidates.strokes, noise) if np.sign(p.depth) == sign]
+            of_pins, by_pins = optics_of_pins(film, rough, noise)
+            if by_pins > balls or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
+                optics[sign], balls = of_pins, by_pins
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and len(seeds.depth) == 0:

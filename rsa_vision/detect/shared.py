@@ -85,69 +85,63 @@ def fit_shared(
     parallel = parallel and len(needles[0].angles) > 1
     sets = clusters(needles)
     windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
-    before = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, _SIZE_ERROR, _SIZE_ERROR]
-    precision = np.diag(np.array(before + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
+    errors = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, _SIZE_ERROR, _SIZE_ERROR]
+    precision = np.diag(np.array(errors + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     # steps weigh pixels as if noise were white, and believe them the more the more neighbours share of it
     held = precision * float(noise.gain(np.hypot(optics.sigma_px, np.median([f.shape.half_width_px for f in needles]))))
-    moved = np.zeros(len(precision))
-    start, taper = optics, needles[0].shape.taper
-    slopes: list[list[Float]] = []
-    since = np.full(OPTICS, np.inf)
-    sizes = _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
+    at = _State(sets, np.zeros(len(precision)), needles[0].shape.taper, _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets]))
+    start, slopes, since = optics, list[list[Float]](), np.full(OPTICS, np.inf)
     last: list[Equations | None] = [None] * len(sets)
+    before: tuple[_State, list[Equations], _Step] | None = None
     converged, shorter, least = False, 0, np.inf
-    for step in range(steps + 1):
-        if (np.abs(moved[:OPTICS] - since) > _MUCH).any():
-            slopes, since = [by_optics(w, m, optics) for w, m in zip(windows, sets, strict=True)], moved[:OPTICS].copy()
+    for count in range(steps + 1):
+        optics = _moved_optics(start, at.moved)
+        if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any():
+            slopes, since = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)], at.moved[:OPTICS]
         systems = [
-            linearise(w, m, k, optics, noise, parallel, sizes.typical, spread, before)
-            for w, m, k, spread, before in zip(windows, sets, slopes, sizes.spread, last, strict=True)
+            linearise(w, m, k, optics, noise, parallel, at.sizes.typical, spread, e)
+            for w, m, k, spread, e in zip(windows, at.sets, slopes, at.sizes.spread, last, strict=True)
         ]
         last = [*systems]
-        cost = sum(e.cost for e in systems) + float(moved @ held @ moved)
-        if cost > least + len(moved) and shorter < _SHORTER and step < steps:
-            # far from a straight line: back, and not as far
-            (moved, taper, sets, sizes, systems), shorter = was, shorter + 1
-            change, moves, converged = change / 3, [own / 3 for own in moves], False
+        cost = sum(e.cost for e in systems) + float(at.moved @ held @ at.moved)
+        if before and cost > least + len(held) and shorter < _SHORTER and count < steps:
+            at, systems, step = before  # far from a straight line: back, and not as far
+            step, shorter, converged = step.shorter(), shorter + 1, False
         else:
             told = [e.information() for e in systems]
             normal = held + sum(matrix for matrix, _ in told)
-            if step == steps or converged:
+            if count == steps or converged:
                 break
             least, shorter = cost, 0
-            change = _step(normal, sum(target for _, target in told) - held @ moved, taper)
+            change = _change(normal, sum(target for _, target in told) - held @ at.moved, at.taper)
             if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
                 change[:OPTICS] = 0.0  # new tables for so little are not worth their time
             far = float(change @ normal @ change) / len(change)
-            moves = [e.step(change) for e in systems]
-            surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, moves, strict=True)])
-            converged = step > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
+            step = _Step(change, [e.step(change) for e in systems])
+            surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, step.own, strict=True)])
+            converged = count > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
             converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
             if converged and not alike:
                 break  # from so near the last step gets there as well; that to the sizes of all is longer
-            was = moved, taper, sets, sizes, systems
-        moved = moved + change
-        taper += change[2]
-        optics = _moved_optics(start, moved)
-        sets = [_moved(e.members, own, change, taper, parallel) for e, own in zip(systems, moves, strict=True)]
-        sizes = replace(sizes, typical=sizes.typical + change[OPTICS:SHARED])
-        if alike and step + 1 == _SIZES_AFTER:
-            sizes, converged, least = _sizes(systems, sets), False, np.inf
+        before = at, systems, step
+        at = at.after(step, systems, parallel)
+        if alike and count + 1 == _SIZES_AFTER:
+            at, converged, least = replace(at, sizes=_sizes(systems, at.sets)), False, np.inf
     systems = [e.in_white_noise(w, noise) for e, w in zip(systems, windows, strict=True)]
     told = [e.information() for e in systems]
     normal = precision + sum(matrix for matrix, _ in told)
-    change = _step(normal, sum(target for _, target in told) - precision @ moved, taper)
-    moves = [e.step(change) for e in systems]
-    taper, optics = taper + change[2], _moved_optics(start, moved + change)
-    sets = [_moved(e.members, own, change, taper, parallel) for e, own in zip(systems, moves, strict=True)]
-    left = np.array([e.noise_under(own, change) for e, own in zip(systems, moves, strict=True)])
+    change = _change(normal, sum(target for _, target in told) - precision @ at.moved, at.taper)
+    step = _Step(change, [e.step(change) for e in systems])
+    at = at.after(step, systems, parallel)
+    optics = _moved_optics(start, at.moved)
+    left = np.array([e.noise_under(own, change) for e, own in zip(systems, step.own, strict=True)])
     # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
     under = at_rims(min(usual_square(left), 1.0)) if len(needles) >= LEAST else 1.0
     by_noise = [_by_noise(window, e, noise) for window, e in zip(windows, systems, strict=True)]
-    errors = _common_errors(systems, by_noise, normal, precision, under)
+    of_common = _common_errors(systems, by_noise, normal, precision, under)
     out = []
-    for window, e, members, scatter in zip(windows, systems, sets, by_noise, strict=True):
-        out += _finished(window, e, members, under * scatter, errors, noise, converged)
+    for window, e, members, scatter in zip(windows, systems, at.sets, by_noise, strict=True):
+        out += _finished(window, e, members, under * scatter, of_common, noise, converged)
     if alike:
         tips = [scatter[: len(e.tips), : len(e.tips)] for scatter, e in zip(by_noise, systems, strict=True)]
         by_ground = np.concatenate(errors_by_ground(film, windows, systems, tips, noise))
@@ -155,7 +149,7 @@ def fit_shared(
     return out, optics
 
 
-def _step(normal: Float, target: Float, taper: float) -> Float:
+def _change(normal: Float, target: Float, taper: float) -> Float:
     """Change of the common parameters, not too far at once; the taper stays within its bounds, the others follow."""
     change = np.linalg.solve(normal, target).astype(np.float64)
     change *= _as_far(change)
@@ -179,6 +173,33 @@ class _Sizes:
 
     typical: Float
     spread: list[Float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """A change of the common parameters (c,), and of the own ones of each set."""
+
+    change: Float
+    own: list[Float]
+
+    def shorter(self) -> _Step:
+        return _Step(self.change / 3, [own / 3 for own in self.own])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """Where a fit is: needles by sets, what the common parameters (c,) differ from the start, their taper and their sizes."""
+
+    sets: list[list[NeedleFit]]
+    moved: Float
+    taper: float
+    sizes: _Sizes
+
+    def after(self, step: _Step, systems: list[Equations], parallel: bool) -> _State:
+        taper = self.taper + float(step.change[2])
+        sets = [_moved(e.members, own, step.change, taper, parallel) for e, own in zip(systems, step.own, strict=True)]
+        sizes = replace(self.sizes, typical=self.sizes.typical + step.change[OPTICS:SHARED])
+        return _State(sets, self.moved + step.change, taper, sizes)
 
 
 def _sizes(systems: list[Equations], sets: list[list[NeedleFit]]) -> _Sizes:
