@@ -125,7 +125,8 @@ def polarities(
             rough = [p for p in pins + look_for_pins(film, candidates.strokes, noise) if np.sign(p.depth) == sign]
             of_pins, by_pins = optics_of_pins(film, rough, noise)
             if by_pins > balls or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
-                optics[sign], balls = of_pins, by_pins
+                optics[sign] = of_pins
+            balls = max(by_pins, balls if balls >= _LEAST_EVIDENCE else 0.0)
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and len(seeds.depth) == 0:

@@ -129,19 +129,20 @@ def test_a_rod_is_no_pin() -> None:
     assert len(tips)
 
 
-def test_what_lies_over_pins_is_part_of_their_errors() -> None:
-    """A texture as coarse as pins are long: no fit can tell it from them, nor would it be seen in what is left."""
+def test_what_lies_over_pins_is_part_of_their_errors_and_is_no_ball() -> None:
+    """Mottle over a part of the film: fits take it up, so that it is not seen in what they leave, and its spots are far fainter."""
     rng = np.random.default_rng(14)
+    part = 1 / (1 + np.exp(-(np.arange(SIDE) - 0.6 * SIDE) / 20))
     square = []
-    for _ in range(4):
-        texture = gaussian_filter(rng.standard_normal((SIDE, SIDE)), 5.0)
-        values, tips, ways = film_of_pins(rng, base=0.6 * (1 + 0.02 * texture / texture.std()), quanta=20 * QUANTA)
+    for amount, coarse_px in ((0.01, 4.0), (0.02, 6.0), (0.04, 9.0)):
+        mottle = gaussian_filter(rng.standard_normal((SIDE, SIDE)), coarse_px)
+        values, tips, ways = film_of_pins(rng, base=0.6 * (1 + amount * part * mottle / mottle.std()), quanta=20 * QUANTA)
         found = detect_markers(values, bits=16).images
-        found = found.rows(found.shape == "pin")
+        assert found.shape.tolist() == ["pin"] * len(tips)
         nearest = np.hypot(*(found.position_px[:, None] - tips).transpose(2, 0, 1)).argmin(axis=1)
         missed = np.einsum("ni,ni->n", found.position_px - tips[nearest], ways[nearest])
         square.append(missed**2 / np.einsum("ni,nij,nj->n", ways[nearest], found.covariance_px2, ways[nearest]))
-    every = np.concatenate(square)
-    print(f"{len(every)} of 64; error / stated {np.sqrt(np.mean(every)):.2f}; largest {np.sqrt(np.max(every)):.1f}")
-    assert len(every) > 0.9 * 64
-    assert 0.6 < np.sqrt(np.mean(every)) < 1.4
+    ratio = float(np.sqrt(np.mean(square)))
+    print(f"error / stated {ratio:.2f}; largest {np.sqrt(np.max(square)):.1f}")
+    assert 0.6 < ratio < 1.4
+    assert np.max(square) < 4.0**2
