@@ -164,7 +164,7 @@ def _one_polarity(
     clear = balls.rows(~touching & ~drawn & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
     under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
     balls, ratio, covered = settle(film, balls, places, under, ~touching & ~drawn, edged, beside, optics, noise)
-    left, poor = what_is_left(balls, under, noise)
+    left, poor = what_is_left(balls, under, optics.sigma_px, noise)
     poor |= covered
     keep = left < BENT * MISFIT
     ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)

@@ -87,6 +87,11 @@ def join(parts: list[BallFits]) -> BallFits:
     return BallFits(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(BallFits)))
 
 
+def radii(sigma_px: float) -> tuple[float, float]:
+    """Return the smallest and the largest radius of a fit: less against the blur is any speck, and tables end."""
+    return max(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px)
+
+
 def half_size(radius_px: float, sigma_px: float) -> int:
     """Return the half side of a window that holds a ball and enough background to tell it from its curvature."""
     return int(np.ceil(1.9 * radius_px + 3.0 * sigma_px + 2.0))
@@ -162,7 +167,8 @@ def fit_balls(
     own = pixels.side <= halves[:, None]
     valid = (patches.valid.reshape(n, -1).take(pixels.place, axis=1) & own).astype(np.float32)
     local = start_px - patches.corner_px
-    low, high = np.maximum(RADIUS_PX[0], 0.42 * sigma_px), np.minimum(min(RADIUS_PX[1], 20.0 * sigma_px), halves - sigma_px)
+    low, largest = radii(sigma_px)
+    high = np.minimum(largest, halves - sigma_px)
     radius = np.clip(start_radius_px, low, high)
     depth = np.zeros(n)
     converged = np.zeros(n, bool)

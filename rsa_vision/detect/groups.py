@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.ball_equations import invert, polynomial
-from rsa_vision.detect.balls import RADIUS_PX, BallFits, half_size, uneven, uneven_white
+from rsa_vision.detect.balls import BallFits, half_size, radii, uneven, uneven_white
 from rsa_vision.detect.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import columns, cut, damped_solution, weighted_least_squares
@@ -67,8 +67,8 @@ def fit_group(
     k = len(start_px)
     window = window_around(film, start_px, start_radius_px, sigma_px, noise, others)
     size, cols, rows, valid, data = window.size, window.cols, window.rows, window.valid, window.raw - window.neighbours
-    local, radius = start_px - window.corner_px, np.clip(start_radius_px, RADIUS_PX[0], RADIUS_PX[1]).astype(np.float64)
-    low, high = max(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20 * sigma_px)
+    low, high = radii(sigma_px)
+    local, radius = start_px - window.corner_px, np.clip(start_radius_px, low, high).astype(np.float64)
     surface = window.surface
     weight = valid / noise.variance_at(window.raw)
     images = images_in(window, surface, local, radius, sigma_px, mu_px)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import RADIUS_PX, BallFits
-from rsa_vision.detect.decide import EDGE
+from rsa_vision.detect.balls import BallFits, radii
+from rsa_vision.detect.decide import EDGE, height_of, of_odd_size
 from rsa_vision.detect.find import CHANCE, DOUBTFUL, MISFIT, misfit
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.needles import excess_of, significant_misfit
@@ -28,11 +28,11 @@ _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the 
 _OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
 
 
-def what_is_left(balls: BallFits, usual: float, noise: NoiseModel) -> tuple[Float, Bool]:
+def what_is_left(balls: BallFits, usual: float, sigma_px: float, noise: NoiseModel) -> tuple[Float, Bool]:
     """Return the misfit of each ball, and which are not described well."""
     under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
     left = misfit(under, noise, CHANCE)
-    specks = balls.radius_px <= RADIUS_PX[0]  # as small as a fit may be: how small they are is not known, nor what they are
+    specks = balls.radius_px <= radii(sigma_px)[0]  # as small as a fit may be: how small they are is not known, nor what they are
     return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE) | specks
 
 
@@ -97,6 +97,7 @@ def table_of(
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
+    flags[:n][of_odd_size(balls)] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it
@@ -111,5 +112,7 @@ def table_of(
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
+    # of what is small against the blur hardly any of its depth is seen
+    high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
     trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
-    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(snr, CAP))
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))

@@ -1,0 +1,50 @@
+"""The table of a film's marker images: what is unlike the others, and how much all of it speaks for a polarity."""
+
+import numpy as np
+
+from rsa_vision.detect import detect_markers
+from rsa_vision.detect.find import fit_at
+from rsa_vision.detect.noise import estimate_noise
+from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.table import table_of
+from rsa_vision.flags import MarkerFlag
+
+from .films import film_of_balls, grid_of_balls, stored
+from .test_balls import BACKGROUND, DEPTH, nearest
+
+
+def test_a_ball_of_a_size_of_its_own_is_flagged_and_measured_all_the_same() -> None:
+    rng = np.random.default_rng(1)
+    truth, radius = grid_of_balls(rng, 4, 80.0, (3.9, 4.1))
+    radius[5] = 5.6
+    film = film_of_balls((360, 360), truth, radius, background=BACKGROUND, depth=DEPTH, noise_sd=DEPTH * BACKGROUND / 20, rng=rng)
+    found = detect_markers(stored(film), bits=16)
+    index, gap = nearest(truth, found)
+    assert gap.max() < 0.2
+    assert np.flatnonzero(found.images.flags[index] == MarkerFlag.UNLIKE).tolist() == [5]
+    assert not np.delete(found.images.flags[index], 5).any()
+
+
+def test_balls_of_many_sizes_are_unlike_nothing() -> None:
+    rng = np.random.default_rng(2)
+    truth, radius = grid_of_balls(rng, 3, 110.0, (3.0, 9.0))
+    film = film_of_balls((380, 380), truth, radius, background=BACKGROUND, depth=DEPTH, noise_sd=DEPTH * BACKGROUND / 20, rng=rng)
+    found = detect_markers(stored(film), bits=16).images
+    assert len(found) == len(truth)
+    assert not found.flags.any()
+
+
+def test_dots_are_no_more_evidence_for_balls_in_a_wide_blur_than_they_are_high() -> None:
+    """Their depths can be anything: as small balls in a blur as wide as they are they would be opaque many times over."""
+    rng = np.random.default_rng(3)
+    truth, radius = grid_of_balls(rng, 4, 80.0, (1.3, 1.3))
+    high = 6.0  # standard deviations of the noise
+    film = film_of_balls((360, 360), truth, radius, background=BACKGROUND, depth=1.0, sigma_px=3.0, rng=rng) - BACKGROUND
+    film *= high * 300.0 / np.ptp(film)
+    values = stored(film + BACKGROUND + 300.0 * rng.standard_normal(film.shape))
+    noise, optics = estimate_noise(values, 16), Optics(3.1, 0.5)
+    fits = fit_at(values, truth, radius, optics, noise)
+    plain = np.zeros(len(truth), bool)
+    images, evidence = table_of(values, 16, fits, 1.0, np.ones(len(truth)), plain, plain, [], optics, noise)
+    assert np.median(images.snr) > 3 * high
+    assert 0.5 * high * len(truth) < evidence < 2 * high * len(truth)
