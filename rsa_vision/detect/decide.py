@@ -142,20 +142,22 @@ def faint_beside(fits: BallFits, needles: list[NeedleFit], sigma_px: float, nois
     return np.asarray(low & (mine / noises[0] < FAINT * np.quantile(height / noises[1], _LOW)))
 
 
-def of_odd_size(fits: BallFits) -> Bool:
-    """Say which balls have a size that hardly another of the film has, where there are enough of one size: dots of letters, screw tips.
+def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> Bool:
+    """Say which have a size that hardly another of the film has, where there are enough of one size: dots of letters, screw tips.
 
     Parameters
     ----------
-    fits : BallFits
-        The balls of a film.
+    size_px, variance_px2 : ndarray of shape (n,)
+        Radii of the balls of a film, or half widths of its pins or tees; their variances.
+    alike : float
+        Standard deviation of the logarithms of the sizes of one kind.
 
     Returns
     -------
     ndarray of bool, shape (n,)
     """
-    size, variance = np.log(fits.radius_px), fits.covariance[:, 2, 2] / fits.radius_px**2
-    apart = np.abs(size[:, None] - size) / np.sqrt(variance[:, None] + variance + _ALIKE**2)
+    size, variance = np.log(size_px), variance_px2 / size_px**2
+    apart = np.abs(size[:, None] - size) / np.sqrt(variance[:, None] + variance + alike**2)
     company = (apart < _APART).sum(axis=1)
     return np.asarray((company < LEAST_KNOWN) & (company.max(initial=0) >= _COMPANY))
 

@@ -23,6 +23,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 
 EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
+_NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
@@ -97,7 +98,10 @@ def table_of(
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
-    flags[:n][of_odd_size(balls)] |= MarkerFlag.UNLIKE
+    flags[:n][of_odd_size(balls.radius_px, balls.covariance[:, 2, 2])] |= MarkerFlag.UNLIKE
+    arms = np.array([len(t.angles) for t in tees])
+    for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
+        flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it
@@ -108,6 +112,7 @@ def table_of(
     covariance[:n] += EXACT_PX**2 * np.eye(2) + doubt_of_number(balls)
     lost = np.linalg.eigvalsh(covariance[:n])[:, -1] > (_LOST * balls.radius_px) ** 2
     flags[:n][lost] |= MarkerFlag.POOR_FIT
+    flags[n:][np.linalg.eigvalsh(covariance[n:])[:, -1] > (2 * radius[n:]) ** 2] |= MarkerFlag.POOR_FIT
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
