@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.find import ROUNDNESS, STRENGTH, distinct, first_look
+from rsa_vision.detect.decide import faint_beside
+from rsa_vision.detect.find import COARSE_SIGMA_PX, ROUNDNESS, STRENGTH, distinct, first_look
 from rsa_vision.detect.leftover import noise_at_marks
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
@@ -110,23 +111,26 @@ def polarities(
     """
     weight, optics, looks, noises = {-1: 0.0, 1: 0.0}, {}, {}, {}
     for sign in signs:
-        mine = seeds.rows(np.sign(seeds.depth) == sign)
+        # by mottle no blur of pins is told
+        slim = [p for p in pins if is_slim(p) and np.sign(p.depth) == sign]
+        mine = seeds.rows((np.sign(seeds.depth) == sign) & ~faint_beside(seeds, slim, COARSE_SIGMA_PX, noise))
         noises[sign] = noise_at_marks(film, mine, noise)
         if noises[sign] is not noise:  # not all that was unlike a ball in less noise is none
             round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
             mine = distinct(_look(film, round_ones, pins, noises[sign]), noises[sign])
+            mine = mine.rows(~faint_beside(mine, slim, COARSE_SIGMA_PX, noises[sign]))
         looks[sign] = mine
         optics[sign], balls = estimate_optics(film, mine, noises[sign])
         strength = -sign * candidates.junctions[:, 4]
         clear = strength > CLEAR_JUNCTION
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
-        elif balls < max(_LEAST_EVIDENCE, _OF_A_TEE * sum(is_slim(p) and np.sign(p.depth) == sign for p in pins)):
-            rough = [p for p in pins + look_for_pins(film, candidates.strokes, noise) if np.sign(p.depth) == sign]
-            of_pins, by_pins = optics_of_pins(film, rough, noise)
-            if by_pins > balls or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
+        elif balls < _LEAST_EVIDENCE:
+            of_pins, balls = optics_of_pins(
+                film, [p for p in pins + look_for_pins(film, candidates.strokes, noise) if np.sign(p.depth) == sign], noise
+            )
+            if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
                 optics[sign] = of_pins
-            balls = max(by_pins, balls if balls >= _LEAST_EVIDENCE else 0.0)
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and len(seeds.depth) == 0:
