@@ -20,7 +20,6 @@ EDGE = 16.0  # more variance than this around a ball, in units of the noise, is 
 SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
 LEAST_KNOWN = 3  # balls that tell what one of them is like on this film
 _COMPANY = 6  # sure ones of one size that stand for each other where none is clear enough for a pattern
-_ALIKE, _APART = 0.035, 3.0  # of radii of one kind, where curve and background differ; standard deviations
 _LIKE = 1.25  # images whose spreads are within this factor are of one size
 _SMALLER, _LARGER = 0.7, 1.45  # range of sizes around those of the sure ones: marks of one film are of few sizes
 _FAR = 1.5  # beyond that range, and twice the misfit that a ball may leave: no better fit comes back from there
@@ -140,26 +139,6 @@ def faint_beside(fits: BallFits, needles: list[NeedleFit], sigma_px: float, nois
     mine, noises = height_of(fits, sigma_px), [np.sqrt(noise.variance_at(at)) for at in (fits.background, background)]
     low = mine < FAINT * np.quantile(height, _LOW)
     return np.asarray(low & (mine / noises[0] < FAINT * np.quantile(height / noises[1], _LOW)))
-
-
-def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> Bool:
-    """Say which have a size that hardly another of the film has, where there are enough of one size: dots of letters, screw tips.
-
-    Parameters
-    ----------
-    size_px, variance_px2 : ndarray of shape (n,)
-        Radii of the balls of a film, or half widths of its pins or tees; their variances.
-    alike : float
-        Standard deviation of the logarithms of the sizes of one kind.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-    """
-    size, variance = np.log(size_px), variance_px2 / size_px**2
-    apart = np.abs(size[:, None] - size) / np.sqrt(variance[:, None] + variance + alike**2)
-    company = (apart < _APART).sum(axis=1)
-    return np.asarray((company < LEAST_KNOWN) & (company.max(initial=0) >= _COMPANY))
 
 
 def _like_these(known: Bool, fits: BallFits, height: Float) -> Bool:

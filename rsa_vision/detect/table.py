@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits, radii
-from rsa_vision.detect.decide import EDGE, height_of, of_odd_size
+from rsa_vision.detect.decide import EDGE, height_of
 from rsa_vision.detect.find import CHANCE, DOUBTFUL, MISFIT, misfit
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.needles import excess_of, significant_misfit
@@ -18,6 +18,7 @@ from rsa_vision.detect.optics import CAP
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import doubt_of_number
 from rsa_vision.detect.settle import STRUCTURE
+from rsa_vision.detect.unlike import of_odd_size, too_pale
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
@@ -98,7 +99,6 @@ def table_of(
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
-    flags[:n][of_odd_size(balls.radius_px, balls.covariance[:, 2, 2])] |= MarkerFlag.UNLIKE
     arms = np.array([len(t.angles) for t in tees])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
@@ -113,6 +113,10 @@ def table_of(
     lost = np.linalg.eigvalsh(covariance[:n])[:, -1] > (_LOST * balls.radius_px) ** 2
     flags[:n][lost] |= MarkerFlag.POOR_FIT
     flags[n:][np.linalg.eigvalsh(covariance[n:])[:, -1] > (2 * radius[n:]) ** 2] |= MarkerFlag.POOR_FIT
+    pale = too_pale(depth[:n], balls.covariance[:, 3, 3], balls.background, flags[:n] == 0)
+    marks = np.flatnonzero(~pale)  # what is none is no company for another's odd size
+    odd = marks[of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])]
+    flags[np.append(np.flatnonzero(pale), odd)] |= MarkerFlag.UNLIKE
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))

@@ -1,0 +1,81 @@
+"""What is unlike the other marks of a film: of a size of its own, or paler than they are wherever they lie."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rsa_vision.detect.alike import SD_OF_MAD
+from rsa_vision.detect.decide import LEAST_KNOWN
+from rsa_vision.types import Bool, Float
+
+_COMPANY = 6  # marks of one kind that tell what is unlike them
+_ALIKE, _APART = 0.035, 3.0  # of radii of one kind, where curve and background differ; standard deviations
+_BESIDE = 5  # known balls nearest in background, on either side
+_SCATTERED = 0.6  # the part of one and the same film value that is primary radiation differs by no more: from 0.5 to 0.8 of it
+_CHANCE = 2.0  # standard deviations of two depths, each
+
+
+def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> Bool:
+    """Say which have a size that hardly another of the film has, where there are enough of one size: dots of letters, screw tips.
+
+    Parameters
+    ----------
+    size_px, variance_px2 : ndarray of shape (n,)
+        Radii of the balls of a film, or half widths of its pins or tees; their variances.
+    alike : float
+        Standard deviation of the logarithms of the sizes of one kind.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    size, variance = np.log(size_px), variance_px2 / size_px**2
+    apart = np.abs(size[:, None] - size) / np.sqrt(variance[:, None] + variance + alike**2)
+    company = (apart < _APART).sum(axis=1)
+    return np.asarray((company < LEAST_KNOWN) & (company.max(initial=0) >= _COMPANY))
+
+
+def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:
+    """Say which balls are paler than those of the film on values both darker and lighter than theirs: staples, letters, tips of screws.
+
+    What balls of one metal take away goes with the light that there is and with the gradient of the film, which is highest at one value and
+    falls to either side. Whatever that function is, then, a ball between two others in background is no paler than the paler of them, but
+    for scattered light, noise, and what the film's balls scatter by in this very figure. Of several neighbours on one side the deepest one
+    stands for marks: a row of staples has more corners than there are balls beside it.
+
+    Parameters
+    ----------
+    depth, variance : ndarray of shape (n,)
+        Depths of balls, without sign, and their variances.
+    background : ndarray of shape (n,)
+    known : ndarray of bool, shape (n,)
+        Nothing speaks against these as yet.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None where too few are known.
+    """
+    doubt = _CHANCE * np.sqrt(variance)
+    pale = np.zeros(len(depth), bool)
+    while True:
+        marks = known & ~pale
+        usual = np.array([_between(depth - doubt, background, marks, i) for i in range(len(depth))])
+        told = marks & (usual > 0)
+        if np.count_nonzero(told) < _COMPANY:
+            return pale
+        part = np.log(depth[told] / usual[told])
+        spread = SD_OF_MAD * float(np.median(np.abs(part - np.median(part))))
+        paler = depth + doubt < min(_SCATTERED, np.exp(-_APART * spread)) * usual
+        if not (paler & ~pale).any():
+            return pale
+        pale |= paler
+
+
+def _between(depth: Float, background: Float, marks: Bool, i: int) -> float:
+    """Depth that a mark has at least on a background between those of others; 0 where it lies between none."""
+    offset = background - background[i]
+    others = marks & (np.arange(len(depth)) != i)
+    sides = [np.flatnonzero(others & side) for side in (offset <= 0, offset > 0)]
+    nearest = [side[np.argsort(np.abs(offset[side]), kind="stable")[:_BESIDE]] for side in sides]
+    return max(min(float(depth[side].max(initial=0.0)) for side in nearest), 0.0)

@@ -1,0 +1,110 @@
+"""What is paler than a film's balls wherever they lie, told from balls that are pale because of what they lie on."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rsa_vision.detect import detect_markers
+from rsa_vision.detect.unlike import too_pale
+from rsa_vision.flags import MarkerFlag
+
+from .films import film_of_balls, grid_of_balls, stored
+from .test_balls import BACKGROUND, DEPTH, nearest
+
+Response = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+SD = 0.02  # of depths
+
+
+def linear(background: NDArray[np.float64]) -> NDArray[np.float64]:
+    return background - 0.15
+
+
+def humped(background: NDArray[np.float64]) -> NDArray[np.float64]:
+    return 0.1 + np.exp(-0.5 * ((background - 0.6) / 0.15) ** 2)
+
+
+def level(background: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.full(len(background), 0.5)
+
+
+def pale(depth: NDArray[np.float64], background: NDArray[np.float64]) -> list[int]:
+    return np.flatnonzero(too_pale(depth, (SD * depth) ** 2, background, np.ones(len(depth), bool))).tolist()
+
+
+@pytest.mark.parametrize("gradient", [(0.0, 0.0), (0.5, 0.3)])
+def test_things_of_a_balls_size_and_less_than_half_as_deep_are_flagged(gradient: tuple[float, float]) -> None:
+    """Their size alone does not tell them, nor do there have to be few: a row of staples has many corners."""
+    rng = np.random.default_rng(1)
+    truth, _ = grid_of_balls(rng, 5, 80.0, (4.0, 4.0))
+    radius = rng.uniform(3.95, 4.05, 25)
+    paler = [6, 11, 12, 13, 17, 18]
+    part = np.full(25, DEPTH)
+    part[paler] *= 0.35
+    place = 1 + truth @ np.array(gradient) / 440.0
+    film = film_of_balls(
+        (440, 440), truth, radius, background=BACKGROUND, depth=part * place, gradient=gradient, noise_sd=DEPTH * BACKGROUND / 30, rng=rng
+    )
+    found = detect_markers(stored(film), bits=16)
+    index, gap = nearest(truth, found)
+    assert gap.max() < 0.3
+    assert np.flatnonzero(found.images.flags[index] == MarkerFlag.UNLIKE).tolist() == paler
+    assert not np.delete(found.images.flags[index], paler).any()
+
+
+@pytest.mark.parametrize("response", [linear, humped, level])
+def test_balls_are_as_deep_as_their_background_lets_them_be(response: Response) -> None:
+    """Whatever function of the background their depth is, as long as it has one peak, on whatever part of the film most of them lie."""
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        background = np.concatenate([rng.uniform(0.2, 1.0, rng.integers(2, 12)), rng.normal(0.9, 0.02, rng.integers(2, 15))])
+        depth = response(background) * rng.uniform(0.85, 1.0, len(background)) * (1 + SD * rng.standard_normal(len(background)))
+        assert pale(depth, background) == []
+
+
+@pytest.mark.parametrize("response", [linear, humped, level])
+def test_what_is_a_third_as_deep_as_balls_on_darker_and_lighter_film_is_too_pale(response: Response) -> None:
+    rng = np.random.default_rng(3)
+    background = np.linspace(0.3, 1.0, 20)
+    depth = response(background) * (1 + SD * rng.standard_normal(20))
+    things = [5, 9, 10, 11, 14]
+    depth[things] *= 0.33
+    assert pale(depth, background) == things
+
+
+def test_nothing_is_known_of_balls_on_backgrounds_of_their_own_nor_on_films_of_few() -> None:
+    background = np.linspace(0.3, 1.0, 12)
+    depth = np.full(12, 0.5)
+    depth[[0, 11]] = 0.1
+    assert pale(depth, background) == []
+    few = np.array([0.5, 0.5, 0.1, 0.5, 0.5])
+    assert pale(few, background[:5]) == []
+
+
+def test_doubtful_depths_are_not_too_pale() -> None:
+    background, depth, sd = np.linspace(0.3, 1.0, 12), np.full(12, 0.5), np.full(12, 0.01)
+    depth[5], sd[5] = 0.2, 0.1
+    assert not too_pale(depth, sd**2, background, np.ones(12, bool)).any()
+
+
+def test_balls_that_scatter_much_make_nothing_too_pale() -> None:
+    rng = np.random.default_rng(4)
+    depth = 0.5 * np.exp(0.5 * rng.standard_normal(30))
+    depth[15] = 0.15
+    assert pale(depth, np.linspace(0.3, 1.0, 30)) == []
+
+
+def test_what_is_too_pale_is_no_company_for_an_odd_size() -> None:
+    """Three of one size of their own could be marks of another kind, did one of them not take away too little."""
+    rng = np.random.default_rng(5)
+    truth, radius = grid_of_balls(rng, 4, 80.0, (3.95, 4.05))
+    radius[[5, 6, 9]] = 5.6
+    for part, expected in ((1.0, []), (0.3, [5, 6, 9])):
+        depth = np.full(16, DEPTH)
+        depth[9] *= part
+        film = film_of_balls((360, 360), truth, radius, background=BACKGROUND, depth=depth, noise_sd=DEPTH * BACKGROUND / 30, rng=rng)
+        found = detect_markers(stored(film), bits=16)
+        index, gap = nearest(truth, found)
+        assert gap.max() < 0.3
+        assert np.flatnonzero(found.images.flags[index] == MarkerFlag.UNLIKE).tolist() == expected
