@@ -36,12 +36,12 @@ def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> B
 
 
 def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:
-    """Say which balls are paler than those of the film on values both darker and lighter than theirs: staples, letters, tips of screws.
+    """Say which balls are paler than those of the film on darker and on lighter values let expect: staples, letters, tips of screws.
 
-    What balls of one metal take away goes with the light that there is and with the gradient of the film, which is highest at one value and
-    falls to either side. Whatever that function is, then, a ball between two others in background is no paler than the paler of them, but
-    for scattered light, noise, and what the film's balls scatter by in this very figure. Of several neighbours on one side the deepest one
-    stands for marks: a row of staples has more corners than there are balls beside it.
+    What balls of one metal take away goes with the light that there is and the gradient of the film: on linear films with the value, on
+    others with an arch over the values, highest where the film is steepest. Between two others in background, then, a ball is at least as
+    deep as the chord between them, but for scattered light, noise, and what the film's balls scatter by in this very figure. Of several
+    neighbours on one side the deepest one stands for marks: a row of staples has more corners than there are balls beside it.
 
     Parameters
     ----------
@@ -65,8 +65,9 @@ def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> B
         if np.count_nonzero(told) < _COMPANY:
             return pale
         part = np.log(depth[told] / usual[told])
-        spread = SD_OF_MAD * float(np.median(np.abs(part - np.median(part))))
-        paler = depth + doubt < min(_SCATTERED, np.exp(-_APART * spread)) * usual
+        middle = float(np.median(part))
+        spread = SD_OF_MAD * float(np.median(np.abs(part - middle)))
+        paler = depth + doubt < min(_SCATTERED, np.exp(middle - _APART * spread)) * usual
         if not (paler & ~pale).any():
             return pale
         pale |= paler
@@ -77,5 +78,8 @@ def _between(depth: Float, background: Float, marks: Bool, i: int) -> float:
     offset = background - background[i]
     others = marks & (np.arange(len(depth)) != i)
     sides = [np.flatnonzero(others & side) for side in (offset <= 0, offset > 0)]
+    if min(len(side) for side in sides) == 0:
+        return 0.0
     nearest = [side[np.argsort(np.abs(offset[side]), kind="stable")[:_BESIDE]] for side in sides]
-    return max(min(float(depth[side].max(initial=0.0)) for side in nearest), 0.0)
+    ends = [side[np.argmax(depth[side])] for side in nearest]
+    return max(float(np.interp(0.0, offset[ends], depth[ends])), 0.0)

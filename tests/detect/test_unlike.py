@@ -21,8 +21,8 @@ def linear(background: NDArray[np.float64]) -> NDArray[np.float64]:
     return background - 0.15
 
 
-def humped(background: NDArray[np.float64]) -> NDArray[np.float64]:
-    return 0.1 + np.exp(-0.5 * ((background - 0.6) / 0.15) ** 2)
+def arched(background: NDArray[np.float64]) -> NDArray[np.float64]:
+    return background * (1.1 - background)
 
 
 def level(background: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -53,9 +53,9 @@ def test_things_of_a_balls_size_and_less_than_half_as_deep_are_flagged(gradient:
     assert not np.delete(found.images.flags[index], paler).any()
 
 
-@pytest.mark.parametrize("response", [linear, humped, level])
+@pytest.mark.parametrize("response", [linear, arched, level])
 def test_balls_are_as_deep_as_their_background_lets_them_be(response: Response) -> None:
-    """Whatever function of the background their depth is, as long as it has one peak, on whatever part of the film most of them lie."""
+    """Whatever function of the background their depth is, as long as it is no hollow, on whatever part of the film most of them lie."""
     rng = np.random.default_rng(2)
     for _ in range(50):
         background = np.concatenate([rng.uniform(0.2, 1.0, rng.integers(2, 12)), rng.normal(0.9, 0.02, rng.integers(2, 15))])
@@ -63,7 +63,7 @@ def test_balls_are_as_deep_as_their_background_lets_them_be(response: Response) 
         assert pale(depth, background) == []
 
 
-@pytest.mark.parametrize("response", [linear, humped, level])
+@pytest.mark.parametrize("response", [linear, arched, level])
 def test_what_is_a_third_as_deep_as_balls_on_darker_and_lighter_film_is_too_pale(response: Response) -> None:
     rng = np.random.default_rng(3)
     background = np.linspace(0.3, 1.0, 20)
