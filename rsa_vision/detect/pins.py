@@ -108,23 +108,23 @@ def find_pins(
     if not rough:
         return [], optics
     taper, sample = _best_taper(film, rough[:_SAMPLE], optics, noise)
-    if not any(is_pin(f) for f in sample):
+    if not any(is_pin(f, noise) for f in sample):
         return [], optics
     optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
     more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
-    optics = common_optics(film, [f for f in sample + more if is_pin(f)], optics, noise)
-    sample = [_refit(film, f, optics, noise) for f in sample if is_pin(f)]
+    optics = common_optics(film, [f for f in sample + more if is_pin(f, noise)], optics, noise)
+    sample = [_refit(film, f, optics, noise) for f in sample if is_pin(f, noise)]
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
     pins = [
         min((_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes), key=_left)
         for f, shapes in zip(rough, starts, strict=True)
     ]
-    pins = _pointed(film, _distinct([f for f in pins if is_pin(f)]), optics, noise)
-    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f)]
+    pins = _pointed(film, _distinct([f for f in pins if is_pin(f, noise)]), optics, noise)
+    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f, noise)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0
-    return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f)], optics
+    return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f, noise)], optics
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
@@ -149,7 +149,7 @@ def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel
         _, sample = _best_taper(film, rough[:_SAMPLE], optics, noise)
         left = float(np.mean([_left(f) for f in sample])) if sample else np.inf
         if left < least:
-            least, best, pins = left, optics, [f for f in sample if is_pin(f)]
+            least, best, pins = left, optics, [f for f in sample if is_pin(f, noise)]
     return best, float(sum(min(f.significance, 50.0) for f in pins))
 
 
@@ -191,11 +191,11 @@ def is_slim(fit: NeedleFit) -> bool:
     return fit.shape.length_px > SLIM * fit.shape.half_width_px
 
 
-def is_pin(fit: NeedleFit) -> bool:
-    """Say whether a fit looks like a pin: little misfit, slim, all of it on the film."""
+def is_pin(fit: NeedleFit, noise: NoiseModel) -> bool:
+    """Say whether a fit looks like a pin: little misfit that chance does not explain, slim, all of it on the film."""
     if not np.isfinite(fit.misfit) or fit.significance < _SIGNIFICANT or fit.valid_fraction < 0.9:
         return False
-    return bool(is_slim(fit) and fit.misfit < MISFIT and explains(fit, EXPLAINED))
+    return bool(is_slim(fit) and significant_misfit(fit, noise) < MISFIT and explains(fit, EXPLAINED))
 
 
 def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
@@ -214,7 +214,7 @@ def _pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: N
         if by <= _SURER_THAN_ROD:
             ways = [fit, _refit(film, _turned(fit), optics, noise)]
             best, other = sorted(ways, key=_left)
-            rather = is_pin(best) and _of_a_kind(best, typical) and _worse_by(film, best, other, optics, noise) > _RATHER_THAN_TURNED
+            rather = is_pin(best, noise) and _of_a_kind(best, typical) and _worse_by(film, best, other, optics, noise) > _RATHER_THAN_TURNED
             clear += [best] if rather and _surer_than_rod(film, best, optics, noise) > _RATHER_THAN_ROD else []
     return clear
 

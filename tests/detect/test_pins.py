@@ -5,6 +5,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
+from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
+from rsa_vision.detect.noise import estimate_noise
+from rsa_vision.detect.pins import is_pin
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin
 
@@ -54,6 +57,21 @@ def film_of_pins(
         counts = 1 / (1 + (DENSE / (counts + 0.5 * base)) ** 2)
     values = 60000 - 50000 * counts if bright else 50000 * counts
     return np.clip(np.rint(values), 0, 65535).astype(np.uint16), np.array(tips), np.array(ways)
+
+
+def test_chance_is_not_blamed_on_a_pin() -> None:
+    rng = np.random.default_rng(1)
+    noise = estimate_noise(np.rint(rng.normal(3e4, 100, (300, 300))).astype(np.uint16), 16)
+
+    def pin(n_core: int) -> NeedleFit:
+        """A pin five times as deep as the noise, under which a third more than that is left."""
+        return NeedleFit(
+            np.zeros(2), np.zeros(1), NeedleShape(2.5, 20.0), np.array([-500.0]), -500.0, 3e4, np.eye(2), n_core, 1.33, 1.0, 0.85, 1.0,
+            0.115, 20.0, True,
+        )  # fmt: skip
+
+    assert is_pin(pin(90), noise)  # two standard deviations of the mean square of so few pixels
+    assert not is_pin(pin(900), noise)
 
 
 @pytest.mark.parametrize("kind", ["cones", "cylinders with a point", "bright", "on a gradient", "seen at a slant", "of two sizes"])
