@@ -14,7 +14,7 @@ from rsa_vision.detect.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.needle_optics import common_optics
 from rsa_vision.detect.needle_sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, on_arms
-from rsa_vision.detect.needles import excess_of, explains, fit_needles, significant_misfit
+from rsa_vision.detect.needles import STANDS_OUT, excess_of, explains, fit_needles, significant_misfit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared
@@ -23,7 +23,7 @@ from rsa_vision.types import Bool, Float
 SLIM = 4.5  # length over half the width; two balls side by side have four
 EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters leave more
 BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
-MOST_STROKES = 60  # strongest of a film
+MOST_STROKES = 120  # strongest of a film, most of them seen by two filters
 _MOST_IN_VAIN = 20  # strokes in a row that are no pins
 _ROUGH, _STANDS_OUT_ROUGHLY = 0.85, 11.0  # explained by a first look, with guessed optics; its significance
 _SIGNIFICANT = 9.0
@@ -107,7 +107,7 @@ def find_pins(
     rough = _distinct([f for f, on in zip(rough, on_tees, strict=True) if not on])
     if not rough:
         return [], optics
-    taper, sample = _best_taper(film, rough[:_SAMPLE], optics, noise)
+    _, taper, sample = _likeliest(film, rough[:_SAMPLE], [optics], noise)
     if not any(is_pin(f, noise) for f in sample):
         return [], optics
     optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
@@ -120,11 +120,11 @@ def find_pins(
         min((_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes), key=_left)
         for f, shapes in zip(rough, starts, strict=True)
     ]
-    pins = _pointed(film, _distinct([f for f in pins if is_pin(f, noise)]), optics, noise)
-    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f, noise)]
+    pins = _pointed(film, _distinct([f for f in pins if is_pin(f, noise, _STANDS_OUT_ROUGHLY)]), optics, noise)
+    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f, noise, _STANDS_OUT_ROUGHLY)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0
-    return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f, noise)], optics
+    return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f, noise, _STANDS_OUT_ROUGHLY)], optics
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
@@ -142,28 +142,35 @@ def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel
     evidence : float
         Significance of the pins.
     """
-    best, pins = Optics(COARSE_SIGMA_PX, COARSE_MU_PX, rough=True), list[NeedleFit]()
-    least = np.inf
-    for sigma in BLURS_PX:
-        optics = Optics(sigma, COARSE_MU_PX, rough=True)
-        _, sample = _best_taper(film, rough[:_SAMPLE], optics, noise)
-        left = float(np.mean([_left(f) for f in sample])) if sample else np.inf
-        if left < least:
-            least, best, pins = left, optics, [f for f in sample if is_pin(f, noise)]
-    return best, float(sum(min(f.significance, 50.0) for f in pins))
+    if not rough:
+        return Optics(COARSE_SIGMA_PX, COARSE_MU_PX, rough=True), 0.0
+    trials = [Optics(sigma, COARSE_MU_PX, rough=True) for sigma in BLURS_PX]
+    optics, _, sample = _likeliest(film, rough[:_SAMPLE], trials, noise)
+    return optics, float(sum(min(f.significance, 50.0) for f in sample if is_pin(f, noise)))
 
 
-def _best_taper(film: NDArray[Any], sample: list[NeedleFit], optics: Optics, noise: NoiseModel) -> tuple[float, list[NeedleFit]]:
-    """Fit pins of every taper: pins with a short point leave more than full cones do."""
-    best, kept, least = TAPERS[0], sample, np.inf
-    for taper in TAPERS:
-        fits = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in sample]
-        left = float(np.mean([_left(f) for f in fits])) if fits else np.inf
-        if left < least:
-            best, kept, least = taper, fits, left
-        if least < _CLOSE_FIT:
-            break
-    return best, kept
+def _likeliest(
+    film: NDArray[Any], sample: list[NeedleFit], trials: list[Optics], noise: NoiseModel
+) -> tuple[Optics, float, list[NeedleFit]]:
+    """Choose of these optics and of all tapers those with which pins leave least, each of them on the same pixels.
+
+    What no pin explains has a say that is bounded; of full cones that explain all, none is asked for other tapers.
+    """
+    widest = max(trials, key=lambda optics: optics.sigma_px)
+    windows = [window_of(film, [f], widest, noise, None) for f in sample]
+    fits, chi2 = {}, {}
+    for optics in trials:
+        for taper in TAPERS:
+            tried = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in sample]
+            fits[optics, taper] = tried
+            chi2[optics, taper] = np.array([chi2_of(window, f, optics, noise) for window, f in zip(windows, tried, strict=True)])
+            if tried and np.mean([_left(f) for f in tried]) < _CLOSE_FIT:
+                break
+    least = np.min(list(chi2.values()), axis=0)
+    scale = 2 * np.maximum(least / [len(window.data) for window in windows], 1.0)
+    worse = {trial: float(np.minimum((left - least) / scale, _SURER_THAN_ROD).sum()) for trial, left in chi2.items()}
+    best = min(worse, key=lambda trial: worse[trial])
+    return *best, fits[best]
 
 
 def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
@@ -191,11 +198,14 @@ def is_slim(fit: NeedleFit) -> bool:
     return fit.shape.length_px > SLIM * fit.shape.half_width_px
 
 
-def is_pin(fit: NeedleFit, noise: NoiseModel) -> bool:
-    """Say whether a fit looks like a pin: little misfit that chance does not explain, slim, all of it on the film."""
+def is_pin(fit: NeedleFit, noise: NoiseModel, stands_out: float = STANDS_OUT) -> bool:
+    """Say whether a fit looks like a pin: little misfit that chance does not explain, slim, all of it on the film.
+
+    ``stands_out``: significance from which noise may hide its form.
+    """
     if not np.isfinite(fit.misfit) or fit.significance < _SIGNIFICANT or fit.valid_fraction < 0.9:
         return False
-    return bool(is_slim(fit) and significant_misfit(fit, noise) < MISFIT and explains(fit, EXPLAINED))
+    return bool(is_slim(fit) and significant_misfit(fit, noise) < MISFIT and explains(fit, EXPLAINED, stands_out))
 
 
 def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
@@ -205,16 +215,18 @@ def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel
 def _pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Keep what is no rod; where noise hides the points of some, those of their kind tell that they are pins."""
     surer = [_surer_than_rod(film, f, optics, noise) for f in pins]
-    clear = [f for f, by in zip(pins, surer, strict=True) if by > _SURER_THAN_ROD]
+    alone = [by > _SURER_THAN_ROD and is_pin(f, noise) for f, by in zip(pins, surer, strict=True)]
+    clear = [f for f, enough in zip(pins, alone, strict=True) if enough]
     typical = float(np.median([f.shape.length_px for f in clear[:_SAMPLE]])) if clear else np.nan
     clear = [f for f in clear if _of_a_kind(f, typical)]
     if len(clear) < _LEAST_OF_A_KIND:
         return clear
-    for fit, by in zip(pins, surer, strict=True):
-        if by <= _SURER_THAN_ROD:
+    for fit, enough in zip(pins, alone, strict=True):
+        if not enough:
             ways = [fit, _refit(film, _turned(fit), optics, noise)]
             best, other = sorted(ways, key=_left)
-            rather = is_pin(best, noise) and _of_a_kind(best, typical) and _worse_by(film, best, other, optics, noise) > _RATHER_THAN_TURNED
+            rather = is_pin(best, noise, _STANDS_OUT_ROUGHLY) and _of_a_kind(best, typical)
+            rather = rather and _worse_by(film, best, other, optics, noise) > _RATHER_THAN_TURNED
             clear += [best] if rather and _surer_than_rod(film, best, optics, noise) > _RATHER_THAN_ROD else []
     return clear
 

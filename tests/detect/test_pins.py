@@ -74,6 +74,15 @@ def test_chance_is_not_blamed_on_a_pin() -> None:
     assert not is_pin(pin(900), noise)
 
 
+@pytest.mark.parametrize("seed", [6, 11])
+def test_pins_of_a_film_tell_their_taper_together_where_noise_hides_it_in_each(seed: int) -> None:
+    film, tips, _ = film_of_pins(np.random.default_rng(seed), quanta=40.0)
+    images = detect_markers(film, bits=16).images
+    assert (images.shape == "pin").all()
+    gap = np.hypot(*(tips[:, None] - images.position_px).transpose(2, 0, 1)).min(axis=1)
+    assert np.count_nonzero(gap > 6.0) <= 1  # of 16 along pins of 20 px; one tip is known to 1.5
+
+
 @pytest.mark.parametrize("kind", ["cones", "cylinders with a point", "bright", "on a gradient", "seen at a slant", "of two sizes"])
 def test_finds_all_tips_within_their_stated_errors(kind: str) -> None:
     rng = np.random.default_rng(5)
