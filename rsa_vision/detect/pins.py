@@ -113,7 +113,7 @@ def find_pins(
     optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
     more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
     optics = common_optics(film, [f for f in sample + more if is_pin(f, noise)], optics, noise)
-    sample = [_refit(film, f, optics, noise) for f in sample if is_pin(f, noise)]
+    _, taper, sample = _likeliest(film, [f for f in sample if is_pin(f, noise)], [optics], noise)  # a wide blur feigns a short point
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
     pins = [
@@ -154,18 +154,20 @@ def _likeliest(
 ) -> tuple[Optics, float, list[NeedleFit]]:
     """Choose of these optics and of all tapers those with which pins leave least, each of them on the same pixels.
 
-    What no pin explains has a say that is bounded; of full cones that explain all, none is asked for other tapers.
+    What no pin explains has a say that is bounded.
     """
     widest = max(trials, key=lambda optics: optics.sigma_px)
     windows = [window_of(film, [f], widest, noise, None) for f in sample]
     fits, chi2 = {}, {}
     for optics in trials:
-        for taper in TAPERS:
-            tried = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in sample]
-            fits[optics, taper] = tried
-            chi2[optics, taper] = np.array([chi2_of(window, f, optics, noise) for window, f in zip(windows, tried, strict=True)])
-            if tried and np.mean([_left(f) for f in tried]) < _CLOSE_FIT:
+        tried, last = sample, np.full(len(sample), np.inf)
+        for taper in TAPERS:  # each from the one before: a cone is longer than the pin with a short point that it stands for
+            tried = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in tried]
+            left = np.array([chi2_of(window, f, optics, noise) for window, f in zip(windows, tried, strict=True)])
+            fits[optics, taper], chi2[optics, taper] = tried, left
+            if np.mean(left > last) > 0.5:
                 break
+            last = left
     least = np.min(list(chi2.values()), axis=0)
     scale = 2 * np.maximum(least / [len(window.data) for window in windows], 1.0)
     worse = {trial: float(np.minimum((left - least) / scale, _SURER_THAN_ROD).sum()) for trial, left in chi2.items()}
