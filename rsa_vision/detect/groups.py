@@ -22,6 +22,7 @@ from rsa_vision.types import Float
 
 _STEPS = 25
 _CONVERGED_PX = 1e-3
+_MOST_PX, _LAST_PX = 0.5, 1.0  # of a step; of the last one, which is not held near: from farther off no straight line leads there
 _LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
 _MOST_BENT = 1.0  # half windows to a radius
 KNOTS = 1.5  # blur widths between the knots of a profile across an edge
@@ -88,7 +89,7 @@ def fit_group(
             weight = valid / noise.variance_at(linear @ theta + window.neighbours)
         delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 6 else 1e-7)
         move = delta[: 3 * k].reshape(3, k)
-        scale = min(1.0, 0.5 / max(float(np.abs(move).max()), 1e-9))
+        scale = min(1.0, _MOST_PX / max(float(np.abs(move).max()), 1e-9))
         if (move * before).sum() < 0:  # too far: without this faint pairs go to and fro for ever
             scale *= 0.5
         before = move
@@ -106,6 +107,7 @@ def fit_group(
     root = np.sqrt(weight)[:, None]
     estimator = _estimator(jac * root, size, noise)[: 4 * k]
     last = (estimator @ (residual * root[:, 0])).reshape(4, k)
+    last *= min(1.0, _LAST_PX / max(float(np.abs(last[:3]).max()), 1e-9))
     influence = np.concatenate([estimator, _estimator(linear * root, size, noise)[:k]]).reshape(5 * k, size, size)
     whole = influence_covariance(influence, noise.correlation)
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])

@@ -84,11 +84,16 @@ class Equations:
         return replace(self, own=own, common=common, residual=residual, normal=white[:-1] @ white[:-1].T)
 
     def noise_under(self, own: Float, common: Float) -> float:
-        """Mean square of what is left under the needles once these changes are made over that beside them, each over what a fit leaves."""
+        """Mean square of what is left under the needles once these changes are made over that beside them, each over what a fit leaves.
+
+        NaN where one of the two has no pixels: in film that is saturated around a needle.
+        """
         square = np.square(self.residual - own @ self.own - common @ self.common)
         leverage = (self.own * (self.inverse @ self.own)).sum(axis=0)
         image = np.abs(np.sum(self.images, axis=0))
         core = image > _CORE * image.max()
+        if core.all() or not core.any():
+            return float("nan")
         under, beside = (square[where].sum() / (1 - leverage[where]).sum() for where in (core, ~core))
         return float(under / beside)
 

@@ -288,7 +288,8 @@ def influence_covariance(influence: NDArray[Any], correlation: Float) -> Float:
     ndarray of shape (..., p, p)
     """
     # by Parseval's theorem in the frequency domain, where the columns of the half spectrum but the first and the middle one stand for two
-    size = tuple(next_fast_len(n + len(correlation) // 2, real=True) for n in influence.shape[-2:])
+    reach = len(correlation) // 2
+    size = tuple(next_fast_len(max(n, reach + 1) + reach, real=True) for n in influence.shape[-2:])
     # to six digits, in half the time of double precision
     spectrum = rfft2(influence.astype(np.float32), s=size).reshape(*influence.shape[:-2], -1)
     weighted = (spectrum * _root_of_power(correlation.tobytes(), len(correlation), size)).view(np.float32)  # real and imaginary parts

@@ -135,8 +135,9 @@ def fit_shared(
     at = at.after(step, systems, parallel)
     optics = _moved_optics(start, at.moved)
     left = np.array([e.noise_under(own, change) for e, own in zip(systems, step.own, strict=True)])
+    left = left[np.isfinite(left)]
     # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
-    under = at_rims(min(usual_square(left), 1.0)) if len(needles) >= LEAST else 1.0
+    under = at_rims(min(usual_square(left), 1.0)) if len(left) >= LEAST else 1.0
     by_noise = [_by_noise(window, e, noise) for window, e in zip(windows, systems, strict=True)]
     of_common = _common_errors(systems, by_noise, normal, precision, under)
     out = []

@@ -16,7 +16,7 @@ from rsa_vision.detect.noise import estimate_noise
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
 
-from .test_covered import SIGMA_PX, check, exposed, light_past_tees, tips_of
+from .test_covered import CELLS, SIDE, SIGMA_PX, check, exposed, light_past_tees, tips_of
 
 
 def test_arms_of_a_few_pixels_are_no_tee() -> None:
@@ -70,3 +70,33 @@ def test_bright_tees_in_transmitted_light(sigma_px: float) -> None:
     found = detect_markers(np.clip(np.rint(film), 0, 65535).astype(np.uint16), bits=16).images
     check(found, tips, list(range(len(tips))))
     assert (found.flags == 0).all()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_one_in_film_that_is_saturated_around_it_leaves_the_others_their_errors() -> None:
+    rng = np.random.default_rng(3)
+    tips = tips_of(rng)
+    lit, half = np.ones((SIDE, SIDE)), SIDE // CELLS // 2
+    col, row = tips[5].astype(int)
+    lit[row - half : row + half, col - half : col + half] = 3.0  # of this tee only the cores of the arms are below the end of the values
+    film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
+    found = detect_markers(np.minimum(film * lit, 65535).astype(np.uint16), bits=16).images
+    apart = found.position_px - tips[:, None]
+    nearest = np.hypot(*apart.transpose(2, 0, 1)).argmin(axis=1)
+    assert (np.hypot(*apart[np.arange(len(tips)), nearest].T) < 0.2).all()
+    error = apart[np.arange(len(tips)), nearest]
+    assert (np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[nearest]), error) < 13.8).all()
+
+
+@pytest.mark.parametrize("gain", [3.0, 4.0])
+def test_saturated_all_over_but_for_the_cores_of_the_arms(gain: float) -> None:
+    """Windows of a few pixels are left."""
+    rng = np.random.default_rng(0)
+    tips = tips_of(rng)
+    film = exposed(light_past_tees(tips, np.ones(len(tips))), rng) * gain
+    found = detect_markers(np.minimum(film, 65535).astype(np.uint16), bits=16).images
+    apart = found.position_px - tips[:, None]
+    gap = np.hypot(*apart.transpose(2, 0, 1))
+    for i in np.flatnonzero(found.flags == 0):
+        error = apart[gap[:, i].argmin(), i]
+        assert error @ np.linalg.solve(found.covariance_px2[i], error) < 13.8
