@@ -1,4 +1,4 @@
-"""What the film beside pins does to their tips, where it goes on under them: bone and tissue that no quadratic background follows."""
+"""What the film beside pins and tees does to their tips, where it goes on under them: bone that no quadratic background follows."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from rsa_vision.detect.surroundings import Places, around_each
 from rsa_vision.types import Float
 
 _DIRECTIONS = 2 * np.pi * np.arange(8) / 8
+_ENOUGH, _SPARSEST = 400, 3  # places of a film, from which only every second or third around each is looked at
 _FARTHER = (1.0, 1.5, 2.2)  # distances, in units of the size of the window
 _MEDIAN = float(chdtri(1.0, 0.5))  # of a square of variance one
+_OF_MEDIAN, _SURE = 2.33, 2.0  # relative error of the median of such squares times the root of their number; standard deviations
 _LEAST = 0.1  # of what noise does, of which less is none
 
 
 def errors_by_ground(
     film: NDArray[Any], windows: list[Window], systems: list[Equations], by_noise: list[Float], noise: NoiseModel
 ) -> list[Float]:
-    """Return what the film at free places beside pins would move their tips by, beyond what its noise does.
+    """Return what the film at free places beside pins or tees would move their tips by, beyond what its noise does.
 
     An estimate is a linear function of the pixels of its window, near enough, and a background is one that it does not see. What that
-    function makes of the film beside the pin, tells what it makes of the film under it.
+    function makes of the film beside a needle, tells what it makes of the film under it.
 
     Parameters
     ----------
@@ -41,29 +43,31 @@ def errors_by_ground(
     Returns
     -------
     list of ndarray of shape (m, 2, 2)
-        px^2, along and across each pin.
+        px^2, along and across the first arm of each.
     """
     members = [f for e in systems for f in e.members]
     way = np.array([[np.cos(f.angles[0]), -np.sin(f.angles[0])] for f in members])
     length = np.array([f.shape.length_px for f in members])
     middle = np.array([f.position_px for f in members]) + 0.5 * length[:, None] * way
+    across = length * np.array([1.0 if len(f.angles) == 1 else 2.0 for f in members])  # with the bar of a tee
     axes = np.stack([way, np.stack([-way[:, 1], way[:, 0]], axis=1)], axis=1)  # (members, 2, 2)
     counts = np.cumsum([0] + [len(e.members) for e in systems])
     angle = np.tile(_DIRECTIONS, len(_FARTHER)) + np.repeat(np.arange(len(_FARTHER)), len(_DIRECTIONS)) * np.pi / 8
     round_about = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.repeat(_FARTHER, len(_DIRECTIONS))[:, None]
+    round_about = round_about[:: max(1, min(len(round_about) * len(members) // _ENOUGH, _SPARSEST))]
     places, figures, variances = [], [], []
     for window, e, scatter, first in zip(windows, systems, by_noise, counts, strict=False):
         mine = slice(first, first + len(e.members))
-        span = max(window.box)
-        offsets = np.rint(span * round_about).astype(np.intp)
-        at = np.stack([window.cols, window.rows], axis=1).astype(np.intp) + offsets[:, None]
-        centre = at.mean(axis=1)
-        free = (at.min(axis=1) >= 0).all(axis=1) & (at.max(axis=1) < film.shape[::-1]).all(axis=1)
-        free &= (np.hypot(*(centre[:, None] - middle).transpose(2, 0, 1)) > 0.5 * (span + length)).all(axis=1)
-        values = film[at[free, :, 1], at[free, :, 0]].astype(np.float64)
+        span, size = max(window.box), np.array(window.box[::-1])
+        corner = np.rint([window.cols.min(), window.rows.min()] + span * round_about).astype(np.intp)
+        centre = corner + 0.5 * size
+        free = (corner >= 0).all(axis=1) & (corner + size <= film.shape[::-1]).all(axis=1)
+        free &= (np.hypot(*(centre[:, None] - middle).transpose(2, 0, 1)) > 0.5 * (span + across)).all(axis=1)
+        boxes = [film[row : row + size[1], col : col + size[0]] for col, row in corner[free]]
+        values = np.array([box.ravel().take(window.place) for box in boxes], np.float64).reshape(len(boxes), len(window.place))
         level = values.mean(axis=1, keepdims=True)
-        tips = e.inverse[e.tips] @ e.own
-        moved = window.whiten((values - level) * np.sqrt(e.weight), noise) @ tips.T
+        of_pixels = window.whiten(e.inverse[e.tips] @ e.own, noise) * np.sqrt(e.weight)  # the filter is its own transpose
+        moved = (values - level) @ of_pixels.T
         moved = np.einsum("kma,mba->kmb", moved.reshape(len(values), -1, 2), axes[mine])
         own = scatter.reshape(len(e.members), 2, len(e.members), 2)[np.arange(len(e.members)), :, np.arange(len(e.members))]
         variance = np.einsum("mba,mac,mbc->mb", axes[mine], own, axes[mine])
@@ -73,6 +77,8 @@ def errors_by_ground(
         near = np.tile(np.arange(len(e.members)), len(values))
         places.append(Places(0, np.arange(first, counts[-1])[: len(e.members)], near, cell, np.zeros((len(near), 0))))
         variances.append(variance)
-    more = np.maximum(around_each(figures, places, len(members), _LEAST) - 1.0, 0.0)
+    more = around_each(figures, places, len(members), _LEAST) - 1.0
+    apart = sum(len(np.unique(these.cell, axis=0)) for these in places)
+    more[more < _SURE * _OF_MEDIAN / np.sqrt(max(apart, 1))] = 0.0  # as much comes of noise
     extra = np.einsum("mb,mba,mbc->mac", more * np.concatenate(variances), axes, axes)
     return np.split(extra, counts[1:-1])

@@ -143,11 +143,9 @@ def fit_shared(
     out = []
     for window, e, members, scatter in zip(windows, systems, at.sets, by_noise, strict=True):
         out += _finished(window, e, members, under * scatter, of_common, noise, converged)
-    if alike:
-        tips = [scatter[: len(e.tips), : len(e.tips)] for scatter, e in zip(by_noise, systems, strict=True)]
-        by_ground = np.concatenate(errors_by_ground(film, windows, systems, tips, noise))
-        out = [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, by_ground, strict=True)]
-    return out, optics
+    tips = [scatter[: len(e.tips), : len(e.tips)] for scatter, e in zip(by_noise, systems, strict=True)]
+    by_ground = np.concatenate(errors_by_ground(film, windows, systems, tips, noise))
+    return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, by_ground, strict=True)], optics
 
 
 def _change(normal: Float, target: Float, taper: float) -> Float:
