@@ -6,7 +6,7 @@ import signal
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
@@ -23,6 +23,7 @@ from rsa_vision.threads import one_thread_each
 if TYPE_CHECKING:
     from rsa_vision.cages import Cage
     from rsa_vision.cameras import Camera
+    from rsa_vision.verdict import Finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,11 +142,44 @@ def measure_task(task: Task) -> Outcome:
     except OSError as error:
         return _failed(files, FilmError.code, f"{error.filename}: cannot be read ({error.strerror})", started, inputs)
     except MemoryError:
-        return _failed(files, "internal", "not enough memory; run fewer --jobs", started, inputs)
+        return _failed(files, "internal", "not enough memory; run fewer --jobs", started, inputs, traceback.format_exc())
     except Exception as error:  # one examination never stops a run; the trace is kept in run.json
         return _failed(files, "internal", f"{type(error).__name__}: {error}", started, inputs, traceback.format_exc())
     write_record(path, {"fingerprint": wanted, "rows": rows, "films": about, "inputs": inputs}, pictures)
     return Outcome(files.subject, files.exam, rows, False, inputs)
+
+
+def without_copies(exams: Sequence[ExamFiles], outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Have those examinations reviewed whose films are given twice: no two exposures are alike to the last bit.
+
+    Parameters
+    ----------
+    exams : sequence of ExamFiles
+    outcomes : sequence of Outcome
+        In the same order.
+
+    Returns
+    -------
+    list of Outcome
+        With the reason ``film-duplicate``; films of the cage alone may serve several examinations.
+    """
+    from rsa_vision.followup import judged  # late: it needs the mathematics
+
+    same: dict[str, list[tuple[int, str]]] = {}
+    for k, (files, outcome) in enumerate(zip(exams, outcomes, strict=True)):
+        for film in files.films if outcome.status != "failed" else ():
+            if not film.cage_only and (content := outcome.inputs.get(film.path.name)):
+                same.setdefault(content, []).append((k, film.path.name))
+    findings: dict[int, list[Finding]] = {}
+    for copies in same.values():
+        for i, (k, name) in enumerate(copies if len(copies) > 1 else ()):
+            others = ", ".join(sorted({printable(other) for j, (_, other) in enumerate(copies) if j != i}))
+            findings.setdefault(k, []).append(("film-duplicate", f"{printable(name)} is the same film as {others}"))
+
+    def judged_again(outcome: Outcome, found: Sequence[Finding]) -> Outcome:
+        return replace(outcome, rows={**outcome.rows, "exams": [judged(outcome.rows["exams"][0], found)]})
+
+    return [judged_again(outcome, findings[k]) if k in findings else outcome for k, outcome in enumerate(outcomes)]
 
 
 def _measure(task: Task, started: float) -> tuple[Rows, list[dict[str, Any]], list[bytes]]:

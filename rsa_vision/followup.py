@@ -255,7 +255,7 @@ def _renamed(exam: _Exam) -> Rows:
     given = {row["number"] for row in images}
     markers = [row for row in markers if row["x_mm"] is not None or name_of(row) in given or not images]
     markers += [missing_row(about, name) for name in sorted(exam.missing, key=natural_key)]
-    row = _judged(exam.rows["exams"][0], exam.findings)
+    row = judged(exam.rows["exams"][0], exam.findings)
     row["message"] = " | ".join(filter(None, [row["message"], exam.told, exam.note]))
     return {**exam.rows, "exams": [row], "images": images, "markers": markers}
 
@@ -273,7 +273,7 @@ def _with_flags(row: Mapping[str, str], flags: int) -> str:
     return flag_names(flag_value(row["flags"] or "") | flags)
 
 
-def _judged(row: Row, findings: Sequence[Finding]) -> Row:
+def judged(row: Row, findings: Sequence[Finding]) -> Row:
     """Return a row of ``exams.csv`` with findings added."""
     verdict = conclude([*((code, row["message"]) for code in filter(None, row["reasons"].split(";"))), *findings])
     messages = [*filter(None, [row["message"]]), *(message for _, message in findings if message not in (row["message"] or ""))]

@@ -141,8 +141,10 @@ def _judge_markers(markers: Markers, limits: Limits) -> list[Finding]:
     parallax = markers.parallax_um
     known = np.isfinite(parallax)
     if known.sum() > 1:
-        mean, sd = float(parallax[known].mean()), float(np.nanmean(markers.crossing_sd_um[known]))
-        if abs(mean) > limits.parallax_um and not abs(mean) < BEND_SIGMA * sd:
+        mean, spread = float(parallax[known].mean()), float(parallax[known].std(ddof=1))
+        # what all markers have in common, as the errors of the foci, is no more than the least of their errors
+        chance = np.hypot(float(np.nanmin(markers.crossing_sd_um[known])), spread / np.sqrt(known.sum()))
+        if abs(mean) > limits.parallax_um and not abs(mean) < BEND_SIGMA * chance:
             findings.append(("film-bend", f"mean y-parallax {mean:.0f} um (limit {limits.parallax_um:.0f})"))
     one_view = markers.name[(markers.flags & MarkerFlag.ONE_VIEW) != 0]
     if len(one_view):

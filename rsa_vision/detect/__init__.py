@@ -163,16 +163,16 @@ def _one_polarity(
     places = free_places(film, balls, place, reach, optics, noise)
     clear = balls.rows(~touching & ~drawn & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
     under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
-    balls, ratio, covered = settle(film, balls, places, under, ~touching & ~drawn, edged, beside, optics, noise)
+    balls, ratio, by_size, covered = settle(film, balls, places, under, ~touching & ~drawn, edged, beside, optics, noise)
     left, poor = what_is_left(balls, under, optics.sigma_px, noise)
     poor |= covered
     keep = left < BENT * MISFIT
     ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
     keep &= ~(poor & ends)
     touching |= ends  # something as high as itself beside it, which a ball on the end of a bar has as well
-    balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
+    balls, ratio, by_size, touching, poor = balls.rows(keep), ratio[keep], by_size[keep], touching[keep], poor[keep]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
-    images, evidence = table_of(film, bits, balls, under, ratio, touching, poor, others, optics, noise)
+    images, evidence = table_of(film, bits, balls, under, ratio, by_size, touching, poor, others, optics, noise)
     return evidence, Detection(images, sign < 0, optics, noise)
 
 

@@ -56,7 +56,7 @@ def settle(
     beside: Beside,
     optics: Optics,
     noise: NoiseModel,
-) -> tuple[BallFits, Float, Bool]:
+) -> tuple[BallFits, Float, Float, Bool]:
     """Fit the centres of balls once more.
 
     Parameters
@@ -81,11 +81,13 @@ def settle(
         With new centres, their covariances, and what is left of the windows.
     ratio : ndarray of shape (n,)
         Squared errors that free places would make of these centres over those that the covariances promise.
+    by_size : ndarray of shape (n,)
+        Variance of centres whose balls are of a size of their own, px^2, as of :func:`rsa_vision.detect.usual.size_unlike`.
     covered : ndarray of bool, shape (n,)
         Something else lies on nearly all of it.
     """
     if len(balls.depth) == 0:
-        return balls, np.ones(0), np.zeros(0, bool)
+        return balls, np.ones(0), np.zeros(0), np.zeros(0, bool)
     around = texture(places, len(free), noise)
     structure = np.where(free[:, None], around.structure, 0.0)
     alone, level = free & ~edged & (balls.chi2_ring < EDGE), mean_beside(places, len(free))
@@ -127,8 +129,9 @@ def settle(
             by_background = solution.estimator * solution.shade
             errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
         ratios.append(errors)
-    out.covariance[edged, :2, :2] += size_unlike(balls.rows(edged), clear)[:, None, None] * np.eye(2)
-    return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], covered > MOST_COVERED
+    by_size = np.zeros(len(free))
+    by_size[edged] = size_unlike(balls.rows(edged), clear)
+    return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], by_size, covered > MOST_COVERED
 
 
 def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: Beside, noise: NoiseModel) -> Windows:

@@ -18,7 +18,7 @@ from rsa_vision.detect.optics import CAP
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import doubt_of_number
 from rsa_vision.detect.settle import STRUCTURE
-from rsa_vision.detect.unlike import of_odd_size, too_pale
+from rsa_vision.detect.unlike import COMPANY, of_odd_size, too_pale
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
@@ -27,6 +27,8 @@ WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 _NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
+_SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
+_UNLIKE = 2.0  # times the misfit that is usual on the film
 _OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
 
 
@@ -35,7 +37,10 @@ def what_is_left(balls: BallFits, usual: float, sigma_px: float, noise: NoiseMod
     under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
     left = misfit(under, noise, CHANCE)
     specks = balls.radius_px <= radii(sigma_px)[0]  # as small as a fit may be: how small they are is not known, nor what they are
-    return left, (left > DOUBTFUL * MISFIT) | (balls.chi2_ring > EDGE) | specks
+    # what all of a film leave is an error of the model, which spares their middles; what is left of two in one comes on top of that
+    most = max(DOUBTFUL * MISFIT, _UNLIKE * float(np.median(left))) if len(left) >= COMPANY else DOUBTFUL * MISFIT
+    beside = np.sqrt(np.maximum(balls.chi2_ring - 1, 0.0) * noise.variance_at(balls.background)) / np.maximum(np.abs(balls.depth), 1e-9)
+    return left, (left > most) | ((balls.chi2_ring > EDGE) & (beside > _SLIGHT)) | specks
 
 
 def table_of(
@@ -44,6 +49,7 @@ def table_of(
     balls: BallFits,
     usual: float,
     ratio: Float,
+    by_size: Float,
     touching: Bool,
     poor_ball: Bool,
     tees: list[NeedleFit],
@@ -61,6 +67,8 @@ def table_of(
         Variance of the noise under balls, in units of that beside them.
     ratio : ndarray of shape (n,)
         Squared errors by their surroundings, as :func:`rsa_vision.detect.settle.settle` tells.
+    by_size : ndarray of shape (n,)
+        Variances of balls of a size of their own, px^2, as of the same: no noise multiplies them.
     touching, poor_ball : ndarray of bool, shape (n,)
         Balls with something as dense beside them; balls that the model does not describe.
     tees : list of NeedleFit
@@ -84,7 +92,7 @@ def table_of(
     excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0)) * ratio
     covariance = np.concatenate(
         [
-            balls.covariance[:, :2, :2] * excess[:, None, None],
+            balls.covariance[:, :2, :2] * excess[:, None, None] + by_size[:, None, None] * np.eye(2),
             np.array([t.covariance_px2 * excess_of(t, noise) for t in tees]).reshape(-1, 2, 2),
         ]
     )

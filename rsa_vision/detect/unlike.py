@@ -8,7 +8,7 @@ from rsa_vision.detect.alike import SD_OF_MAD
 from rsa_vision.detect.decide import LEAST_KNOWN
 from rsa_vision.types import Bool, Float
 
-_COMPANY = 6  # marks of one kind that tell what is unlike them
+COMPANY = 6  # marks of one kind that tell what is unlike them
 _ALIKE, _APART = 0.035, 3.0  # of radii of one kind, where curve and background differ; standard deviations
 _BESIDE = 5  # known balls nearest in background, on either side
 _SCATTERED = 0.6  # the part of one and the same film value that is primary radiation differs by no more: from 0.5 to 0.8 of it
@@ -32,7 +32,7 @@ def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> B
     size, variance = np.log(size_px), variance_px2 / size_px**2
     apart = np.abs(size[:, None] - size) / np.sqrt(variance[:, None] + variance + alike**2)
     company = (apart < _APART).sum(axis=1)
-    return np.asarray((company < LEAST_KNOWN) & (company.max(initial=0) >= _COMPANY))
+    return np.asarray((company < LEAST_KNOWN) & (company.max(initial=0) >= COMPANY))
 
 
 def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:
@@ -62,7 +62,7 @@ def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> B
         marks = known & ~pale
         usual = np.array([_between(depth - doubt, background, marks, i) for i in range(len(depth))])
         told = marks & (usual > 0)
-        if np.count_nonzero(told) < _COMPANY:
+        if np.count_nonzero(told) < COMPANY:
             return pale
         part = np.log(depth[told] / usual[told])
         middle = float(np.median(part))

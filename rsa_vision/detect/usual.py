@@ -14,6 +14,7 @@ _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
 _LEAST_VALUE = 1.0  # of a film
 _OUTLIER = 3.0
+_FEW = 0.25  # clear balls to one that is fitted with an edge, from which they do not tell which sizes are usual
 _LEAST_SIZES = 3  # balls that tell which sizes there are
 
 
@@ -50,12 +51,17 @@ def usual_size(clear: BallFits) -> Size:
 def size_unlike(balls: BallFits, clear: BallFits) -> Float:
     """Return by how much the radii of balls differ from the nearest ones of clear balls, squared, beyond what errors explain; shape (n,).
 
-    What pulls at a radius, as a corner or a second edge beside a ball does, pulls at its centre as much.
+    What pulls at a radius, as a corner or a second edge beside a ball does, pulls at its centre as much. Where clear balls are few, as
+    those in nearly saturated film beside a limb full of structure, what most of the others are like is usual as well.
     """
     if len(clear.depth) < _LEAST_SIZES:
         return np.zeros(len(balls.depth))
     gap = np.square(balls.radius_px[:, None] - clear.radius_px)
-    return np.asarray(np.maximum(gap - balls.covariance[:, None, 2, 2] - clear.covariance[:, 2, 2], 0.0).min(axis=1))
+    more = np.maximum(gap - balls.covariance[:, None, 2, 2] - clear.covariance[:, 2, 2], 0.0).min(axis=1)
+    if len(clear.depth) < _FEW * len(balls.depth):
+        gap = np.square(balls.radius_px - np.median(balls.radius_px))
+        more = np.minimum(more, np.maximum(gap - balls.covariance[:, 2, 2], 0.0))
+    return np.asarray(more)
 
 
 @dataclass(frozen=True, slots=True)

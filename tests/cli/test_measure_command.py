@@ -128,6 +128,24 @@ def test_one_bad_film_never_stops_a_run(folder: Path, tmp_path: Path, other_film
     assert all(messages[subject] for subject in ("EMPTY", "TRUNC", "TEXT", "nameless"))
 
 
+def test_a_film_given_for_two_examinations_is_reviewed_in_both(
+    folder: Path, tmp_path: Path, other_film: Callable[[str, str], Path]
+) -> None:
+    subject, _, exam = FIRST.partition("_")
+    for k in (1, 2):
+        other_film(f"{FIRST}_f{k}.tif", f"{subject}_20270101_f{k}.tif")
+    out = tmp_path / "out"
+    assert run_app(["measure", str(folder), "-o", str(out)]) == 1
+    assert statuses(out) == {
+        FIRST: ("review", "film-duplicate"),
+        SECOND: ("ok", ""),
+        f"{subject}_20270101": ("review", "film-duplicate"),
+    }
+    messages = dict(read(out, "exams").select("exam", "message").iter_rows())
+    assert f"{subject}_20270101_f2.tif is the same film as {FIRST}_f2.tif" in messages["20270101"]
+    assert f"{subject}_20270101_f1.tif" in messages[exam]
+
+
 def test_films_without_pitch_fail_and_name_the_option(tmp_path: Path, exams: list[RenderedExamination]) -> None:
     folder, out = tmp_path / "bare", tmp_path / "out"
     exams[0].write(folder, with_pitch=False)

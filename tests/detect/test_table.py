@@ -1,12 +1,14 @@
 """The table of a film's marker images: what is unlike the others, and how much all of it speaks for a polarity."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.find import fit_at
 from rsa_vision.detect.noise import estimate_noise
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.table import table_of
+from rsa_vision.detect.table import table_of, what_is_left
 from rsa_vision.flags import MarkerFlag
 
 from .films import film_of_balls, grid_of_balls, stored
@@ -45,6 +47,26 @@ def test_dots_are_no_more_evidence_for_balls_in_a_wide_blur_than_they_are_high()
     noise, optics = estimate_noise(values, 16), Optics(3.1, 0.5)
     fits = fit_at(values, truth, radius, optics, noise)
     plain = np.zeros(len(truth), bool)
-    images, evidence = table_of(values, 16, fits, 1.0, np.ones(len(truth)), plain, plain, [], optics, noise)
+    images, evidence = table_of(values, 16, fits, 1.0, np.ones(len(truth)), np.zeros(len(truth)), plain, plain, [], optics, noise)
     assert np.median(images.snr) > 3 * high
     assert 0.5 * high * len(truth) < evidence < 2 * high * len(truth)
+
+
+def test_what_all_balls_of_a_film_leave_is_no_fault_of_one() -> None:
+    rng = np.random.default_rng(5)
+    truth, radius = grid_of_balls(rng, 4, 80.0, (3.9, 4.1))
+    noise_sd = DEPTH * BACKGROUND / 400
+    film = film_of_balls((360, 360), truth, radius, background=BACKGROUND, depth=DEPTH, noise_sd=noise_sd, rng=rng)
+    values = stored(film)
+    noise, optics = estimate_noise(values, 16), Optics(1.1, 0.5)
+    fits = fit_at(values, truth, radius, optics, noise)
+    left = np.full(len(truth), 0.06)  # of the depth: of a blur that is no Gaussian, where there is hardly any noise
+    left[3] = 0.13
+
+    def with_misfit(part: np.ndarray, ring: float) -> np.ndarray:
+        chi2 = 1 + np.square(part * fits.depth) / noise.variance_at(fits.background)
+        return what_is_left(replace(fits, chi2_core=chi2, chi2_ring=np.full(len(part), ring)), 1.0, optics.sigma_px, noise)[1]
+
+    assert np.flatnonzero(with_misfit(left, 1.0)).tolist() == [3]
+    assert with_misfit(np.full(len(truth), 0.01), 20.0).sum() == 0  # 20 times so little noise is no edge
+    assert with_misfit(np.full(len(truth), 0.01), 1 + (0.05 * DEPTH * BACKGROUND / noise_sd) ** 2).all()

@@ -1,0 +1,31 @@
+"""What speaks against a reconstruction."""
+
+import numpy as np
+import pytest
+
+from rsa_vision.settings import Limits
+from rsa_vision.types import Markers
+from rsa_vision.verdict import _judge_markers
+
+
+def markers(parallax_um: np.ndarray, sd_um: np.ndarray) -> Markers:
+    n = len(sd_um)
+    where = np.arange(3.0 * n).reshape(n, 3)
+    names = np.array([f"b/{k}" for k in range(n)])
+    return Markers(names, where, np.tile(np.eye(3), (n, 1, 1)), np.abs(parallax_um), sd_um, parallax_um, np.full(n, 2), np.zeros(n, int))
+
+
+@pytest.mark.parametrize(
+    ("mean_um", "scatter_um", "sd_um", "bent"),
+    [
+        (335.0, 7.0, [400.0, 380, 300, 20, 350, 30], True),  # most markers are measured badly, or said to be
+        (335.0, 7.0, [400.0] * 6, False),  # an error of the foci, that all have in common, may be as large
+        (120.0, 300.0, [20.0] * 6, False),  # as far apart as they are, their mean is no surer
+        (120.0, 7.0, [20.0] * 6, True),
+        (80.0, 7.0, [20.0] * 6, False),  # below the limit
+    ],
+)
+def test_a_common_parallax_is_excused_by_common_errors_alone(mean_um: float, scatter_um: float, sd_um: list[float], bent: bool) -> None:
+    parallax = mean_um + scatter_um * np.array([-1.0, 1, -1, 1, -1, 1])
+    codes = [code for code, _ in _judge_markers(markers(parallax, np.array(sd_um)), Limits(parallax_um=100.0))]
+    assert ("film-bend" in codes) == bent
