@@ -24,6 +24,7 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.shared import fit_shared
 from rsa_vision.detect.templates import SCALE, find_like, promising, template_of
 from rsa_vision.detect.twins import split_twins
+from rsa_vision.detect.usual import proportion
 from rsa_vision.types import Float
 
 _BEFORE = 1.5  # tolerance before attenuation and ends are fitted
@@ -85,6 +86,8 @@ def find_tees(
         tees = fit_all(film, tees, optics, noise)
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
+    depth, background = (np.array([getattr(t, name) for t in nearly]) for name in ("depth", "background"))
+    optics = replace(optics, proportion=proportion(depth, background, background).slope)
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
     clean = [t for t in fitted if is_tee(t)]
