@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import expit, gammaln
 
 from rsa_vision.geometry.rigid import LEAST_POINTS
+from rsa_vision.identify.candidates import candidate_poses, disjoint
 from rsa_vision.identify.packing import pack
-from rsa_vision.identify.poses import GATE, Cloud, Pairs, Placement, candidate_poses, disjoint, nearness, place, volume_mm3
+from rsa_vision.identify.poses import GATE, Cloud, Pairs, Placement, nearness, place, volume_mm3
 from rsa_vision.types import Bool, Float, Int
 
 FOUND: Final = 0.9  # probability that a marker of a known segment is among the points
@@ -100,7 +101,7 @@ def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) ->
         Against all these points being strays, the likeliest first.
     """
     found = candidate_poses(segment, points, float(np.log(volume / stray)))
-    return _likeliest([(log_odds(len(segment), placement, pairs, volume, stray), pairs) for pairs, placement in found])
+    return _sorted([(log_odds(len(segment), placement, pairs, volume, stray), pairs) for pairs, placement in found])[:MOST_RIVALS]
 
 
 def log_odds(n: int, placement: Placement, pairs: Pairs, volume: float, stray: float) -> float:
@@ -141,8 +142,10 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
         left = candidate_poses(before.rows(mine), points.rows(theirs), float(np.log(volume / max(len(theirs), 1)))) if named else []
         again = [(tuple((int(mine[i]), int(theirs[a])) for i, a in pairs), placement) for pairs, placement in left]
         rivals = _additions(before, points, {**dict(listed), **dict(again)}, named, volume)
-        chances, chosen = _summed(rivals, len(points))
-        found = [kept for body in chosen if (kept := tuple(pair for pair in body if chances[pair] >= posterior))]
+        chances, chosen = _summed(rivals[:MOST_RIVALS], len(points))
+        uncounted = float(np.logaddexp.reduce([odds for odds, _ in rivals[MOST_RIVALS:]], initial=-np.inf))
+        sure = {pairs for odds, pairs in rivals if expit(odds - uncounted) >= posterior}  # others may have a rival that was not counted
+        found = [kept for body in chosen if body in sure and (kept := tuple(pair for pair in body if chances[pair] >= posterior))]
         if not found:
             break
         bodies += found
@@ -190,7 +193,7 @@ def _additions(
                 base[old] = fixed.log_likelihood if (fixed := place(before, points, old)) else np.inf
             odds += placement.log_likelihood - base[old] - k * float(np.log(m / volume)) - _log_ways(len(named), len(old))
         rivals[new] = max(rivals.get(new, -np.inf), odds)
-    return _likeliest([(odds, pairs) for pairs, odds in rivals.items()])
+    return _sorted([(odds, pairs) for pairs, odds in rivals.items()])
 
 
 def _log_ways(n: int, k: int) -> float:
@@ -208,8 +211,9 @@ def _odds(placement: Placement, k: int, volume: float, stray: float) -> float:
     return placement.log_likelihood - float(np.log(8 * np.pi**2 * volume)) - k * float(np.log(stray / volume))
 
 
-def _likeliest(rivals: list[tuple[float, Pairs]]) -> list[tuple[float, Pairs]]:
-    return sorted((rival for rival in rivals if rival[0] > NEGLIGIBLE), key=lambda rival: (-rival[0], rival[1]))[:MOST_RIVALS]
+def _sorted(rivals: list[tuple[float, Pairs]]) -> list[tuple[float, Pairs]]:
+    """Return what counts, the likeliest first."""
+    return sorted((rival for rival in rivals if rival[0] > NEGLIGIBLE), key=lambda rival: (-rival[0], rival[1]))
 
 
 def _names(groups: Sequence[Pairs], chances: Float) -> dict[tuple[int, int], float]:
