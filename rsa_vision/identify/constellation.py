@@ -128,8 +128,8 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
 
     Notes
     -----
-    What is decisive is fixed, and the rest looked at again: three points left over on both sides show what three of many cannot, and a
-    group that shares three names or more with what is fixed is judged by what it adds.
+    What is decisive is fixed, and the rest looked at again: three markers left over are three of fewer that could be tried, and a group
+    that shares three names or more with what is fixed is judged by what it adds.
     """
     volume = volume_mm3(points)
     listed = candidate_poses(before, points, float(np.log(volume / max(len(points), 1))))
@@ -173,8 +173,11 @@ def _parts(before: Cloud, points: Cloud, listed: Sequence[tuple[Pairs, Placement
 def _additions(
     before: Cloud, points: Cloud, listed: Mapping[Pairs, Placement], named: Mapping[int, int], volume: float
 ) -> list[tuple[float, Pairs]]:
-    """Return the log odds of what each group adds to the names, that contradict none."""
-    n, m = len(before) - len(named), len(points) - len(named)
+    """Return the log odds of what each group adds to the names, that contradict none.
+
+    The points that are left lie as close to each other as all do: few of them do not make it less of a chance that three fit.
+    """
+    n, m = len(before) - len(named), len(points)
     owner = {a: i for i, a in named.items()}
     base: dict[Pairs, float] = {}
     rivals: dict[Pairs, float] = {}

@@ -85,6 +85,20 @@ def test_a_loose_marker_does_not_make_the_others_of_its_bone_change_places() -> 
     assert named / cases > 0.9
 
 
+@pytest.mark.parametrize(("off_mm", "named"), [(0.04, True), (0.16, False)])
+def test_three_points_left_over_have_names_only_if_they_fit_well(off_mm: float, named: bool) -> None:
+    rng = np.random.default_rng(20)
+    stem = random_body(rng, 7, 8.0) + np.array([0, 64, 0])
+    bone = np.array([[0, 0, 0], [9, 0, 0], [9.4, 13.8, 0]])
+    others = bone - off_mm * np.array([[0, 0, 0], [0, 0, 0], [0.7, 1, 0]])  # as one of these and two others of a bone may lie by chance
+    far = Rotation.from_rotvec([0.5, -1, 0.8]).apply(others) + np.array([4, 5, -8])
+    before, points = measured(rng, np.concatenate([bone, stem]), 0.01), measured(rng, np.concatenate([far, stem]), 0.01)
+    bodies, doubtful = match_bodies(before, points, POSTERIOR)
+    pairs = sorted(pair for body in bodies for pair in body)
+    assert pairs == [(i, i) for i in range(0 if named else 3, 10)]
+    assert doubtful[:3].all() != named
+
+
 @settings(max_examples=50, deadline=None)
 @given(SEEDS, st.integers(3, 6), st.floats(0.0, 2.0))
 def test_the_true_bodies_are_among_what_competes(seed: int, n: int, moved_mm: float) -> None:
