@@ -143,9 +143,9 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
         again = [(tuple((int(mine[i]), int(theirs[a])) for i, a in pairs), placement) for pairs, placement in left]
         rivals = _additions(before, points, {**dict(listed), **dict(again)}, named, volume)
         chances, chosen = _summed(rivals[:MOST_RIVALS], len(points))
-        uncounted = float(np.logaddexp.reduce([odds for odds, _ in rivals[MOST_RIVALS:]], initial=-np.inf))
-        sure = {pairs for odds, pairs in rivals if expit(odds - uncounted) >= posterior}  # others may have a rival that was not counted
-        found = [kept for body in chosen if body in sure and (kept := tuple(pair for pair in body if chances[pair] >= posterior))]
+        odds = {pairs: value for value, pairs in rivals}
+        chances = _with_uncounted(chances, {body: odds[body] for body in chosen}, rivals[MOST_RIVALS:])
+        found = [kept for body in chosen if (kept := tuple(pair for pair in body if chances[pair] >= posterior))]
         if not found:
             break
         bodies += found
@@ -207,6 +207,27 @@ def _summed(rivals: Sequence[tuple[float, Pairs]], m: int) -> tuple[dict[tuple[i
     groups = [pairs for _, pairs in rivals]
     packing = pack([(*(a for _, a in pairs), *(m + i for i, _ in pairs)) for pairs in groups], np.array([odds for odds, _ in rivals]))
     return _names(groups, np.nan_to_num(packing.posterior)), [groups[g] for g in np.flatnonzero(packing.chosen)]
+
+
+def _with_uncounted(
+    chances: Mapping[tuple[int, int], float], chosen: Mapping[Pairs, float], uncounted: Sequence[tuple[float, Pairs]]
+) -> dict[tuple[int, int], float]:
+    """Return the chances of names, less by those rivals of the chosen bodies that were too many to be summed.
+
+    A rival has the odds of its own against those of the markers and points that it takes away, as parts of their bodies.
+    """
+    against: dict[Pairs, list[float]] = {body: [-np.inf] for body in chosen}
+    for odds, rival in uncounted:
+        markers, points = dict(rival), {a: i for i, a in rival}
+        taken = {body: sum(i in markers or a in points for i, a in body) for body in chosen}
+        gain = odds - sum(chosen[body] * count / len(body) for body, count in taken.items())
+        for body in chosen:
+            if any(markers.get(i, a) != a or points.get(a, i) != i for i, a in body):
+                against[body].append(gain)
+    result = dict(chances)
+    for body, gains in against.items():
+        result |= {pair: chances[pair] * float(expit(-np.logaddexp.reduce(gains))) for pair in body}
+    return result
 
 
 def _odds(placement: Placement, k: int, volume: float, stray: float) -> float:
