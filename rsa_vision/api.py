@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsa_vision.api_detect import detect
 from rsa_vision.api_motion import export, growth, motion, precision, write_motion
-from rsa_vision.batch import Outcome, Task, run, without_copies
+from rsa_vision.batch import Outcome, Task, run, with_copies_reviewed
 from rsa_vision.errors import UsageError
 from rsa_vision.ordering import natural_key
 from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
@@ -135,7 +135,7 @@ def measure(
     depends_on = {"settings": _described(settled), "geometry": about, "method": method}
     tasks = [Task(files, settled, geometry, depends_on, out, redo) for files in grouping.exams]
     outcomes = run(tasks, jobs, timeout_s, lambda outcome: watch(outcome, len(tasks)) if watch else None)
-    outcomes = without_copies(grouping.exams, _followed_up(outcomes, known, settled))
+    outcomes = with_copies_reviewed(grouping.exams, _followed_up(outcomes, known, settled))
     write_tables(out, (outcome.rows for outcome in outcomes))
     write_motion(out, settled)
     options = {"method": method, "segments": _hashed(segments), "jobs": jobs, "redo": redo, "timeout_s": timeout_s}

@@ -149,7 +149,7 @@ def measure_task(task: Task) -> Outcome:
     return Outcome(files.subject, files.exam, rows, False, inputs)
 
 
-def without_copies(exams: Sequence[ExamFiles], outcomes: Sequence[Outcome]) -> list[Outcome]:
+def with_copies_reviewed(exams: Sequence[ExamFiles], outcomes: Sequence[Outcome]) -> list[Outcome]:
     """Have those examinations reviewed whose films are given twice: no two exposures are alike to the last bit.
 
     Parameters
