@@ -67,7 +67,8 @@ class Solution:
     inverse: Float  # (n, 10 + k, 10 + k), of the normal matrices
     held: Float  # (n,), how strongly radii are
     residual: Float  # (n, pixels)
-    ground: Float  # (n, pixels), background over its value at the centre, times the ball's image
+    back: Float  # (n, pixels), background over its value at the centre
+    ground: Float  # (n, pixels), that times the ball's image
     structure: Float  # (n, degrees), of the windows themselves
     images: Float  # (n, 10 + k, pixels), what was added up to them
     white: Float  # (n, 10 + k, pixels), those in units of noise made white
@@ -146,6 +147,7 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
         by_weights = invert(normal)[:, :2]
         plain = np.matmul(by_weights, weighted) * root
         apart = np.matmul(by_weights, right[:, :, None])[:, :, 0] - change[:, :2]
+    back = theta[:, 1:] @ surface[1:]
     return Solution(
         local,
         radius,
@@ -157,7 +159,8 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
         inverse,
         held,
         residual,
-        value * (theta[:, 1:] @ surface[1:]),
+        back,
+        value * back,
         structure,
         images,
         seen,

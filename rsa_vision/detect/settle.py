@@ -27,6 +27,7 @@ from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.random_effects import Common, Solution, Windows, hold, solve, variance_of
+from rsa_vision.detect.shoulder import Curve, curve_of, rounding, shown
 from rsa_vision.detect.specks import Specks, find_specks
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import proportion, size_unlike, usual_size
@@ -101,6 +102,7 @@ def settle(
         proportion(balls.depth[told], balls.background[told], level[told]),
         around.differ,
     )
+    curve = curve_of(film)
     usual = float(np.median(balls.chi2_uneven[free])) if free.any() else 1.0  # what all balls leave is no speck on one
     out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
     for these in places:
@@ -117,14 +119,16 @@ def settle(
             crossed, apart = (windows.covered > 0) & (windows.covered <= MOST_COVERED), fits.position_px - balls.position_px[part]
             both = OF_SHIFT * apart[:, :, None] * apart[:, None] * edged[part, None, None]  # both models could be right
             both += OF_SHIFT * ((apart**2).sum(axis=1) * crossed)[:, None, None] * np.eye(2)  # what lies on a ball has any profile
-            fits.covariance[:, :2, :2] += both
+            hidden = _hidden(windows, solution, curve, common)
+            fits.covariance[:, :2, :2] += both + hidden
             # there is an edge, which surfaces do not know: they are believed if they agree with it, or leave less
             chance = np.einsum("ni,ni->n", apart, np.linalg.solve(balls.covariance[part, :2, :2], apart[:, :, None])[:, :, 0])
             stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _AGREE) & (better < CHANCE))
             moved = free[part] & ~(edged[part] & stays)
             out = _put(out, part, fits, moved)
-            stay = free[part] & crossed & ~moved
-            out.covariance[part[stay], :2, :2] += both[stay]
+            both[~crossed] = 0.0
+            stay = free[part] & ~moved
+            out.covariance[part[stay], :2, :2] += (both + hidden)[stay]
             mine = (these.near >= begin) & (these.near < begin + _BATCH)
             by_background = solution.estimator * solution.shade
             errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
@@ -212,6 +216,16 @@ def _of_noise(estimator: Float, weight: Float, side: int, common: Common) -> Flo
     """Covariance of what an estimator makes of noise."""
     by_noise = (estimator / np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]).reshape(-1, 2, side, side)
     return np.asarray(common.under * influence_covariance(by_noise, common.noise.correlation))
+
+
+def _hidden(windows: Windows, found: Solution, curve: Curve, common: Common) -> Float:
+    """Covariance by changes of the light that the film hides beside a ball and shows under it, shape (n, 2, 2)."""
+    fits, side = windows.fits, 2 * windows.half + 1
+    values = fits.background[:, None] + fits.depth[:, None] * found.images[:, 3]
+    offset = np.mgrid[0:side, 0:side].reshape(2, 1, -1)[::-1] - found.local_px.T[:, :, None]  # by columns, by rows
+    rounded = offset * (rounding(fits.background, common.noise) / found.radius_px)[:, None]
+    shown_more = np.stack([shown(values, fits.background, change, curve, common.noise) for change in (found.back, *rounded)], axis=2)
+    return _by(np.matmul(found.estimator, shown_more), np.ones((len(values), 3)))
 
 
 def _surprise(apart: Float, efficient: Float, plain: Float) -> Float:
