@@ -15,7 +15,7 @@ from rsa_vision.detect.needles import PROMISING, between, explains, scored, step
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.whitening import whiten
+from rsa_vision.detect.whitening import Filter
 from rsa_vision.types import Float, Int
 
 _STEPS, _QUICK_STEPS = 16, 5
@@ -53,9 +53,9 @@ class Window:
     place: Int
     box: tuple[int, int]
 
-    def whiten(self, values: Float, noise: NoiseModel) -> Float:
-        """Filter values at the pixels, in units of the noise, shape (p, n), so that the noise in them is white."""
-        return np.asarray(whiten(self._boxes(values), noise).reshape(len(values), -1).take(self.place, axis=1), np.float64)
+    def filtered(self, values: Float, through: Filter) -> Float:
+        """Filter values at the pixels, in units of the noise, shape (p, n)."""
+        return np.asarray(through(self._boxes(values)).reshape(len(values), -1).take(self.place, axis=1), np.float64)
 
     def covariance(self, influence: Float, noise: NoiseModel) -> Float:
         """Return the covariance of linear functions (p, n) of the film's noise at the pixels."""

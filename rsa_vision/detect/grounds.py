@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ from scipy.special import chdtri
 
 from rsa_vision.detect.crossing import Window
 from rsa_vision.detect.needle_equations import Equations
-from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.surroundings import Places, around_each
+from rsa_vision.detect.whitening import Filter
 from rsa_vision.types import Float
 
 _DIRECTIONS = 2 * np.pi * np.arange(8) / 8
@@ -23,7 +25,12 @@ _LEAST = 0.1  # of what noise does, of which less is none
 
 
 def errors_by_ground(
-    film: NDArray[Any], windows: list[Window], systems: list[Equations], by_noise: list[Float], noise: NoiseModel
+    film: NDArray[Any],
+    windows: Sequence[Window],
+    systems: Sequence[Equations],
+    by_noise: Sequence[Float],
+    needles: Sequence[NeedleFit],
+    through: Filter,
 ) -> list[Float]:
     """Return what the film at free places beside pins or tees would move their tips by, beyond what its noise does.
 
@@ -33,23 +40,26 @@ def errors_by_ground(
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
-    windows : list of Window
-    systems : list of Equations
-        Of these windows, in white noise.
-    by_noise : list of ndarray of shape (2 m, 2 m)
+    windows : sequence of Window
+    systems : sequence of Equations
+        Of these windows, filtered.
+    by_noise : sequence of ndarray of shape (2 m, 2 m)
         Covariances of the ``m`` tips of each by noise.
-    noise : NoiseModel
+    needles : sequence of NeedleFit
+        All of the film, in other windows as well.
+    through : Filter
+        Of the equations.
 
     Returns
     -------
     list of ndarray of shape (m, 2, 2)
         px^2, along and across the first arm of each.
     """
-    members = [f for e in systems for f in e.members]
-    way = np.array([[np.cos(f.angles[0]), -np.sin(f.angles[0])] for f in members])
-    length = np.array([f.shape.length_px for f in members])
-    middle = np.array([f.position_px for f in members]) + 0.5 * length[:, None] * way
-    across = length * np.array([1.0 if len(f.angles) == 1 else 2.0 for f in members])  # with the bar of a tee
+    noise, members = through.noise, [f for e in systems for f in e.members]
+    length = np.array([f.shape.length_px for f in needles])
+    middle = np.array([f.position_px for f in needles]) + 0.5 * length[:, None] * _ways(needles)
+    across = length * np.array([1.0 if len(f.angles) == 1 else 2.0 for f in needles])  # with the bar of a tee
+    way = _ways(members)
     axes = np.stack([way, np.stack([-way[:, 1], way[:, 0]], axis=1)], axis=1)  # (members, 2, 2)
     counts = np.cumsum([0] + [len(e.members) for e in systems])
     angle = np.tile(_DIRECTIONS, len(_FARTHER)) + np.repeat(np.arange(len(_FARTHER)), len(_DIRECTIONS)) * np.pi / 8
@@ -66,7 +76,7 @@ def errors_by_ground(
         boxes = [film[row : row + size[1], col : col + size[0]] for col, row in corner[free]]
         values = np.array([box.ravel().take(window.place) for box in boxes], np.float64).reshape(len(boxes), len(window.place))
         level = values.mean(axis=1, keepdims=True)
-        of_pixels = window.whiten(e.inverse[e.tips] @ e.own, noise) * np.sqrt(e.weight)  # the filter is its own transpose
+        of_pixels = window.filtered(e.inverse[e.tips] @ e.own, through) * np.sqrt(e.weight)  # the filter is its own transpose
         moved = (values - level) @ of_pixels.T
         moved = np.einsum("kma,mba->kmb", moved.reshape(len(values), -1, 2), axes[mine])
         own = scatter.reshape(len(e.members), 2, len(e.members), 2)[np.arange(len(e.members)), :, np.arange(len(e.members))]
@@ -82,3 +92,7 @@ def errors_by_ground(
     more[more < _SURE * _OF_MEDIAN / np.sqrt(max(apart, 1))] = 0.0  # as much comes of noise
     extra = np.einsum("mb,mba,mbc->mac", more * np.concatenate(variances), axes, axes)
     return np.split(extra, counts[1:-1])
+
+
+def _ways(needles: Sequence[NeedleFit]) -> Float:
+    return np.array([[np.cos(f.angles[0]), -np.sin(f.angles[0])] for f in needles])

@@ -12,6 +12,7 @@ from rsa_vision.detect.needle_images import NeedleFit, arm_images, arms_by_optic
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.patches import damped_solution
 from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.whitening import Filter
 from rsa_vision.types import Float, Int
 
 OPTICS, SHARED = 6, 8  # common to all: attenuation, blur, taper, curve (2), tail; then logarithms of half width and length; then directions
@@ -77,9 +78,9 @@ class Equations:
         """Change of the own parameters, shape (p,), that goes with one of the common ones."""
         return np.asarray(self.own_alone - self.own_by_common @ change, np.float64)
 
-    def in_white_noise(self, window: Window, noise: NoiseModel) -> Equations:
+    def filtered(self, window: Window, through: Filter) -> Equations:
         """Return the same by generalised least squares."""
-        white = window.whiten(np.concatenate([self.own, self.common, self.residual[None]]), noise)
+        white = window.filtered(np.concatenate([self.own, self.common, self.residual[None]]), through)
         own, common, residual = white[: len(self.own)], white[len(self.own) : -1], white[-1]
         return replace(self, own=own, common=common, residual=residual, normal=white[:-1] @ white[:-1].T)
 

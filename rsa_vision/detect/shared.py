@@ -24,6 +24,7 @@ from rsa_vision.detect.needle_sets import beside_each, clusters
 from rsa_vision.detect.needles import between, scored
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.whitening import Filter
 from rsa_vision.types import Float
 
 _STEPS = 12
@@ -44,6 +45,11 @@ _NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1])  # changes of those with which 
 _MOST = 3.0, 0.8, 0.6  # curve and tail
 _MOST_BY_STEP, _MOST_TAPER_BY_STEP = 0.6, 0.2  # of all these
 _SHORTER = 3  # attempts at a step that loses nothing
+_SQUARE_PX = (
+    17  # side of squares than which all that is slower is left out, on bone; near enough the best for arms of half widths of 2.5 to 4
+)
+_GAIN = 0.2  # of the logarithm of the variance of tips, from which they are
+_ASKED = 8  # windows that tell whether it is to be
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
 
@@ -127,7 +133,8 @@ def fit_shared(
         at = at.after(step, systems, parallel)
         if alike and count + 1 == _SIZES_AFTER:
             at, converged, least = replace(at, sizes=_sizes(systems, at.sets)), False, np.inf
-    systems = [e.in_white_noise(w, noise) for e, w in zip(systems, windows, strict=True)]
+    through = _quietest(film, windows, systems, noise)
+    systems = [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
     told = [e.information() for e in systems]
     normal = precision + sum(matrix for matrix, _ in told)
     change = _change(normal, sum(target for _, target in told) - precision @ at.moved, at.taper)
@@ -138,13 +145,13 @@ def fit_shared(
     left = left[np.isfinite(left)]
     # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
     under = at_rims(min(usual_square(left), 1.0)) if len(left) >= LEAST else 1.0
-    by_noise = [_by_noise(window, e, noise) for window, e in zip(windows, systems, strict=True)]
+    by_noise = [_by_noise(window, e, through) for window, e in zip(windows, systems, strict=True)]
     of_common = _common_errors(systems, by_noise, normal, precision, under)
     out = []
     for window, e, members, scatter in zip(windows, systems, at.sets, by_noise, strict=True):
         out += _finished(window, e, members, under * scatter, of_common, noise, converged)
     tips = [scatter[: len(e.tips), : len(e.tips)] for scatter, e in zip(by_noise, systems, strict=True)]
-    by_ground = np.concatenate(errors_by_ground(film, windows, systems, tips, noise))
+    by_ground = np.concatenate(errors_by_ground(film, windows, systems, tips, out, through))
     return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, by_ground, strict=True)], optics
 
 
@@ -241,10 +248,24 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
     return out
 
 
-def _by_noise(window: Window, e: Equations, noise: NoiseModel) -> Float:
+def _quietest(film: NDArray[Any], windows: list[Window], systems: list[Equations], noise: NoiseModel) -> Filter:
+    """Return the filter with which noise and the film beside some needles move their tips least."""
+    needles = [f for e in systems for f in e.members]
+    asked = slice(None, None, 1 + len(systems) // _ASKED)
+    variances = {}
+    for through in (Filter(noise), Filter(noise, _SQUARE_PX)):
+        some = [e.filtered(w, through) for e, w in zip(systems[asked], windows[asked], strict=True)]
+        scatter = [_by_noise(w, e, through)[: len(e.tips), : len(e.tips)] for e, w in zip(some, windows[asked], strict=True)]
+        by_ground = np.concatenate(errors_by_ground(film, windows[asked], some, scatter, needles, through))
+        variances[through] = np.concatenate([s.diagonal() for s in scatter]) + np.einsum("maa->ma", by_ground).ravel()
+    plain, fine = (float(np.log(v).mean()) for v in variances.values())
+    return list(variances)[fine < plain - _GAIN]
+
+
+def _by_noise(window: Window, e: Equations, through: Filter) -> Float:
     """Covariance that noise which neighbouring pixels share makes of the tips, and of what the common parameters are estimated from."""
     influence = np.concatenate([e.inverse[e.tips] @ e.own, e.common - e.own_by_common.T @ e.own])
-    return window.covariance(window.whiten(influence, noise), noise)
+    return window.covariance(window.filtered(influence, through), through.noise)
 
 
 def _common_errors(systems: list[Equations], by_noise: list[Float], normal: Float, precision: Float, under: float) -> Float:

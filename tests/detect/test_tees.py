@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect import detect_markers, tees
+from rsa_vision.detect import detect_markers, shared, tees
 from rsa_vision.detect.candidates import find_candidates
 from rsa_vision.detect.find import STRENGTH
 from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
 from rsa_vision.detect.noise import estimate_noise
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
+from rsa_vision.detect.whitening import Filter
+from rsa_vision.types import Float
 
 from .test_covered import CELLS, SIDE, SIGMA_PX, check, exposed, light_past_tees, tips_of
 
@@ -115,3 +117,29 @@ def test_on_shaded_film_that_is_linear_in_exposure(seed: int) -> None:
     print(f"RMS {np.sqrt((error**2).mean()):.3f} px, error / sd {np.sqrt(z2.mean() / 2):.2f}")
     assert np.sqrt((error**2).mean()) < 0.04
     assert z2.mean() / 2 < 1.5**2
+
+
+def test_what_bone_does_slowly_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    quietest, measured = shared._quietest, {}
+    for name, choose in (("fine", quietest), ("all", lambda film, windows, systems, noise: Filter(noise))):
+        monkeypatch.setattr(shared, "_quietest", choose)
+        both = [_tees_on_bone(np.random.default_rng(seed)) for seed in range(4)]
+        error, covariance = (np.concatenate(parts) for parts in zip(*both, strict=True))
+        ratio = np.sqrt(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error).mean() / 2)
+        measured[name] = (error**2).mean(), np.median(np.trace(covariance, axis1=1, axis2=2)), ratio
+        print(f"{name}: RMS {np.sqrt(measured[name][0]):.4f} px, error / sd {ratio:.2f}")
+    assert measured["fine"][0] < measured["all"][0]
+    assert measured["fine"][1] < 0.7 * measured["all"][1]
+    assert 0.8 < measured["fine"][2] < 1.2
+
+
+def _tees_on_bone(rng: np.random.Generator) -> tuple[Float, Float]:
+    """Errors of tips and their covariances, on a film of waves as long as the arms of tees and longer."""
+    tips = tips_of(rng)
+    waves = [gaussian_filter(rng.standard_normal((SIDE, SIDE)), px) for px in (75, 20)]
+    bone = np.exp(0.22 * waves[0] / waves[0].std() + 0.07 * waves[1] / waves[1].std())
+    light = gaussian_filter(light_past_tees(tips, np.ones(len(tips)), 0.0625) * bone, SIGMA_PX)
+    film = np.clip(25000 * light * (1 + 0.03 * rng.standard_normal(light.shape)), 0, 65535).astype(np.uint16)
+    found = detect_markers(film, bits=16).images
+    nearest = np.hypot(*(found.position_px - tips[:, None]).transpose(2, 0, 1)).argmin(axis=1)
+    return found.position_px[nearest] - tips, found.covariance_px2[nearest]

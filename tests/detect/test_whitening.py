@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.noise import LAGS, NoiseModel
-from rsa_vision.detect.whitening import whiten
+from rsa_vision.detect.whitening import Filter, whiten
 from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored
@@ -50,6 +50,22 @@ def test_the_filter_is_its_own_transpose(sigma_px: float, part: float, seed: int
     one, two = np.random.default_rng(seed).standard_normal((2, 3, SIDE, SIDE))
     noise = _model(sigma_px, part)
     assert (whiten(one, noise) * two).sum() == pytest.approx((one * whiten(two, noise)).sum(), rel=1e-9, abs=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(0.5, 2.0), st.sampled_from([0.0, 0.5, 1.0]), st.sampled_from([0, 5, 17]), st.integers(0, 100))
+def test_so_is_that_which_takes_out_what_is_slow(sigma_px: float, part: float, side_px: int, seed: int) -> None:
+    one, two = np.random.default_rng(seed).standard_normal((2, 3, SIDE, SIDE + 4)).astype(np.float32)
+    through = Filter(_model(sigma_px, part), side_px)
+    assert (through(one) * two).sum() == pytest.approx((one * through(two)).sum(), rel=1e-3, abs=1e-3)
+    alone = through(one[1:2])
+    assert np.allclose(through(one)[1:2], alone, atol=1e-4)
+
+
+def test_what_is_slow_is_taken_out() -> None:
+    slow = np.add.outer(np.arange(60.0), np.arange(80.0)).astype(np.float32)[None]
+    left = Filter(_model(1.0, 0.0), 17)(slow)[0, 8:-8, 8:-8]
+    assert np.abs(left).max() < 1e-3 * slow.max()
 
 
 def test_white_noise_is_left_alone() -> None:
