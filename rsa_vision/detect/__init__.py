@@ -24,7 +24,7 @@ from rsa_vision.detect.needle_sets import is_located, on_arms
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import MOST_STROKES, find_pins, look_for_pins
-from rsa_vision.detect.polarity import first_looks, off_pins, polarities
+from rsa_vision.detect.polarity import first_looks, is_mottled, off_pins, polarities
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.resolve import resolve_balls
 from rsa_vision.detect.response import BITS, high_balls, in_film_values, is_straighter, log_odds
@@ -105,7 +105,8 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
             if is_straighter(values, noise, other, its_noise, bright, optics):
                 detection = _detect(other, BITS, its_noise, limit, as_it_is=True)
                 return replace(detection, images=in_film_values(detection.images, bits))
-        found.append(_one_polarity(values, bits, sign, optics, mine, pins, candidates, faint, of_marks, limit))
+        mottled = is_mottled(seeds, sign, noise)
+        found.append(_one_polarity(values, bits, sign, optics, mine, pins, candidates, faint, of_marks, limit, mottled))
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
 
 
@@ -120,6 +121,7 @@ def _one_polarity(
     faint: Candidates,
     noise: NoiseModel,
     limit: float,
+    mottled: bool,
 ) -> tuple[float, Detection]:
     junctions = candidates.junctions[np.sign(candidates.junctions[:, 4]) == -sign]
     mine = replace(candidates.rows(np.sign(candidates.strength) == -sign), junctions=junctions)
@@ -137,11 +139,11 @@ def _one_polarity(
     balls, touching, edged, drawn = resolve_balls(film, mine, seeds, limit, optics, noise, needles)
     high = ~faint_beside(balls, tees + pins, optics.sigma_px, noise)
     balls, touching, edged, drawn = balls.rows(high), touching[high], edged[high], drawn[high]
-    keep = are_balls(balls, limit, optics.sigma_px, noise) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
+    keep = are_balls(balls, limit, optics.sigma_px, noise, mottled=mottled) & (np.sign(balls.depth) == sign) & ~_on_arms(balls, tees + pins)
     balls, touching, edged, drawn = balls.rows(keep), touching[keep], edged[keep], drawn[keep]
     more, at_edge, crossed = look_again(film, faint.rows(np.sign(faint.strength) == -sign), balls, limit, optics, noise, needles)
     both = join([balls, more])
-    like = are_balls(both, limit, optics.sigma_px, noise)[len(balls.depth) :]
+    like = are_balls(both, limit, optics.sigma_px, noise, mottled=mottled)[len(balls.depth) :]
     like &= (np.sign(more.depth) == sign) & ~_on_arms(more, tees + pins) & ~faint_beside(more, tees + pins, optics.sigma_px, noise)
     balls, edged, added = join([balls, more.rows(like)]), np.append(edged, at_edge[like]), np.zeros(np.count_nonzero(like), bool)
     touching, drawn = np.append(touching, added), np.append(drawn, crossed[like])  # the last fit does not know what was masked either

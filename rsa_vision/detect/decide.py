@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from rsa_vision.detect.balls import RADIUS_PX, BallFits
-from rsa_vision.detect.find import EXPLAINED, MISFIT, SURE, misfit
+from rsa_vision.detect.find import CHANCE, EXPLAINED, MISFIT, SURE, misfit
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.types import Bool, Float
 
 ALONE = 10.0  # the same for marks of which there are not enough to tell what they are like
+_AMONG_MOTTLE = 20.0  # and those on films of which the other polarity shows nearly as much
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
 _LOST = 0.75  # of that, below which a first fit is too low for a mark
@@ -75,7 +76,7 @@ def _near_in_size(fits: BallFits, radii: Float) -> Bool:
     return np.asarray((fits.radius_px >= _SMALLER / _FAR * radii.min()) & (fits.radius_px < high))
 
 
-def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:
+def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, *, mottled: bool = False) -> Bool:
     """Say which balls are marks.
 
     Parameters
@@ -87,6 +88,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     sigma_px : float
         Blur of the film.
     noise : NoiseModel
+    mottled : bool
+        The other polarity looks much the same: that there are many of one size says nothing.
 
     Returns
     -------
@@ -102,9 +105,10 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < LEAST_KNOWN:
         # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
-        company = _of_like_spread(_spread(fits, sigma_px), sure) >= _COMPANY
-        alone = close & (strength > ALONE) & ~_soft_shadows(fits.radius_px, height, sure & company)
-        return np.asarray((sure & (company | alone)) | (_like_these(sure & company, fits, height) & (strength > max(0.5 * SURE, limit))))
+        whole = sure & (misfit(fits, noise, CHANCE) < MISFIT)  # mottle and the crossings of ribs and vessels leave more than noise
+        known = whole & (_of_like_spread(_spread(fits, sigma_px), whole) >= _COMPANY) & (not mottled)
+        alone = sure & close & (strength > (_AMONG_MOTTLE if mottled else ALONE)) & ~_soft_shadows(fits.radius_px, height, known)
+        return np.asarray(known | alone | (_like_these(known, fits, height) & (strength > max(0.5 * SURE, limit))))
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
     least = np.where(close, FAINT, UNEXCUSED)

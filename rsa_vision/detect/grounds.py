@@ -78,7 +78,7 @@ def errors_by_ground(
         level = values.mean(axis=1, keepdims=True)
         of_pixels = window.filtered(e.inverse[e.tips] @ e.own, through) * np.sqrt(e.weight)  # the filter is its own transpose
         moved = (values - level) @ of_pixels.T
-        moved = np.einsum("kma,mba->kmb", moved.reshape(len(values), -1, 2), axes[mine])
+        moved = np.einsum("kma,mba->kmb", moved.reshape(len(values), len(e.members), 2), axes[mine])
         own = scatter.reshape(len(e.members), 2, len(e.members), 2)[np.arange(len(e.members)), :, np.arange(len(e.members))]
         variance = np.einsum("mba,mac,mbc->mb", axes[mine], own, axes[mine])
         louder = noise.variance_at(level) / noise.variance_at(np.array(e.background))

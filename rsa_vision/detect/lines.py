@@ -81,12 +81,10 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
     Returns
     -------
     ndarray of bool, shape (n,)
-        None where too few balls are clear.
     """
     out, height, clear = np.zeros(len(fits.depth), bool), height_of(fits, optics.sigma_px), look_clear(fits, noise)
-    if np.count_nonzero(clear) < LEAST_KNOWN:
-        return out
-    full = height > _FAINT * np.median(height[clear])
+    known = np.count_nonzero(clear) >= LEAST_KNOWN
+    full = height > _FAINT * np.median(height[clear]) if known else clear
     strong = fits.rows(full)
 
     def beside(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:

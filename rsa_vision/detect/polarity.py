@@ -25,6 +25,7 @@ _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
+_MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: of marks it has next to none
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
 
@@ -76,6 +77,25 @@ def _look(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noi
 def off_pins(fits: BallFits, pins: list[NeedleFit]) -> BallFits:
     """Leave out first looks at what pins explain."""
     return fits.rows(~on_pins(fits.position_px, 1 - fits.explained, [p for p in pins if is_slim(p)]))
+
+
+def is_mottled(looks: BallFits, sign: int, noise: NoiseModel) -> bool:
+    """Say whether first looks of the other sign of depth show nearly as much: shadows that cross, and the gaps between them.
+
+    Parameters
+    ----------
+    looks : BallFits
+        Of both.
+    sign : int
+        Of the marks.
+    noise : NoiseModel
+
+    Returns
+    -------
+    bool
+    """
+    mine, others = (ball_evidence(looks.rows(np.sign(looks.depth) == this), noise) for this in (sign, -sign))
+    return others > _MOTTLE * mine
 
 
 def _of_tees(candidates: Candidates, sign: int) -> float:

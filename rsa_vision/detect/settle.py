@@ -27,7 +27,7 @@ from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.random_effects import Common, Solution, Windows, hold, solve, variance_of
-from rsa_vision.detect.shoulder import Curve, curve_of, rounding, shown
+from rsa_vision.detect.shoulder import Curve, curve_of, shown, unseen_slope
 from rsa_vision.detect.specks import Specks, find_specks
 from rsa_vision.detect.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.usual import proportion, size_unlike, usual_size
@@ -223,8 +223,8 @@ def _hidden(windows: Windows, found: Solution, curve: Curve, common: Common) -> 
     fits, side = windows.fits, 2 * windows.half + 1
     values = fits.background[:, None] + fits.depth[:, None] * found.images[:, 3]
     offset = np.mgrid[0:side, 0:side].reshape(2, 1, -1)[::-1] - found.local_px.T[:, :, None]  # by columns, by rows
-    rounded = offset * (rounding(fits.background, common.noise) / found.radius_px)[:, None]
-    shown_more = np.stack([shown(values, fits.background, change, curve, common.noise) for change in (found.back, *rounded)], axis=2)
+    unseen = offset * unseen_slope(fits.background, windows.half, curve, common.noise)[:, None]
+    shown_more = np.stack([shown(values, fits.background, change, curve, common.noise) for change in (found.back, *unseen)], axis=2)
     return _by(np.matmul(found.estimator, shown_more), np.ones((len(values), 3)))
 
 

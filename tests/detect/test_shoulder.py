@@ -46,7 +46,7 @@ def _noise(level: list[float], variance: list[float]) -> NoiseModel:
 
 
 def test_a_curve_shows_as_much_more_as_it_is_steeper() -> None:
-    curve = Curve(BASE, BLACK)
+    curve = Curve(BASE, BLACK, 0.0)
     level = np.linspace(BASE, BLACK, 40)
     noise = _noise(level.tolist(), (1.5 * QUANTISATION + (1e-3 * (level - BASE) * (BLACK - level)) ** 2).tolist())
     light = np.log(np.array([[4.0, 5.0]]))
@@ -59,7 +59,7 @@ def test_a_curve_shows_as_much_more_as_it_is_steeper() -> None:
 def test_films_with_more_noise_where_there_is_more_light_hide_nothing() -> None:
     noise = _noise([0.0, 60000.0], [QUANTISATION, 40000.0])  # quanta on a linear film
     change = np.linspace(-500.0, 500.0, 9)[None]
-    assert (shown(np.full((1, 9), 20000.0), np.array([59000.0]), change, Curve(0.0, 60000.0), noise) == 0).all()
+    assert (shown(np.full((1, 9), 20000.0), np.array([59000.0]), change, Curve(0.0, 60000.0, 0.0), noise) == 0).all()
 
 
 def test_noise_takes_the_bias_from_rounding() -> None:
