@@ -22,6 +22,7 @@ from rsa_vision.detect.mixed import part
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.needle_sets import is_located, on_arms
 from rsa_vision.detect.noise import NoiseModel, estimate_noise
+from rsa_vision.detect.oblong import are_oblong
 from rsa_vision.detect.painted import paint
 from rsa_vision.detect.pins import MOST_STROKES, find_pins, look_for_pins
 from rsa_vision.detect.polarity import first_looks, is_mottled, off_pins, polarities
@@ -171,6 +172,7 @@ def _one_polarity(
     keep = left < BENT * MISFIT
     ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
     keep &= ~(poor & ends)
+    poor |= are_oblong(film, balls, beside, optics, noise)
     touching |= ends  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, by_size, touching, poor = balls.rows(keep), ratio[keep], by_size[keep], touching[keep], poor[keep]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's

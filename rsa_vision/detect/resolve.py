@@ -20,6 +20,7 @@ from rsa_vision.detect.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, dist
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.lines import without_lines
 from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.oblong import are_oblong
 from rsa_vision.detect.painted import Painted
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.spots import find_spot, with_spot
@@ -92,6 +93,8 @@ def resolve_balls(
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
     clean &= ~perhaps_two(single, single.rows(clean), noise)
+    one_each = single.rows(clean)
+    clean[clean] = ~are_oblong(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, tees, *at), optics, noise)
     sure = single.rows(clean)
     blobs = single.rows(~clean & ~_taken(single, sure))
     pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, tees))

@@ -1,0 +1,42 @@
+"""Two balls nearly in one beam that noise lets pass for one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsa_vision.detect import detect_markers
+
+from .films import film_of_balls, grid_of_balls, stored
+
+SIDE, CELL = 600, 60.0
+RADII = 3.0, 3.75
+FILMS = 6
+
+
+@pytest.mark.parametrize("cnr", [10.0, 15.0])
+def test_two_in_one_are_told_or_flagged(cnr: float) -> None:
+    far = singles = flagged = 0
+    for seed in range(FILMS):
+        rng = np.random.default_rng(seed)
+        truth, _ = grid_of_balls(rng, 9, CELL, RADII)
+        radius = np.full(len(truth), RADII[0])
+        double = np.arange(len(truth)) % 6 == 0
+        angle, apart = rng.uniform(0, 2 * np.pi, len(truth)), rng.uniform(0.45, 0.7, len(truth)) * sum(RADII)
+        second = (truth + apart[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))[double]
+        light = 1 - film_of_balls((SIDE, SIDE), truth, radius, background=1.0, depth=0.5, sigma_px=1.2)
+        other = 1 - film_of_balls((SIDE, SIDE), second, np.full(len(second), RADII[1]), background=1.0, depth=0.5, sigma_px=1.2)
+        noise = rng.standard_normal((SIDE, SIDE))
+        found = detect_markers(stored(30000 * ((1 - light) * (1 - other) + 0.5 / cnr * noise)), bits=16).images
+        both = np.concatenate([truth, second])
+        gap = np.hypot(*(both[:, None] - found.position_px).transpose(2, 0, 1))
+        nearest = gap.argmin(axis=0)
+        error = found.position_px - both[nearest]
+        chi2 = np.einsum("ni,ni->n", error, np.linalg.solve(found.covariance_px2, error[:, :, None])[:, :, 0])
+        sure = found.flags & ~1 == 0  # of lapping ones the covariance knows
+        far += int((sure & (chi2 > 19.3)).sum())
+        alone = np.isin(nearest, np.flatnonzero(~double))
+        singles, flagged = singles + int(alone.sum()), flagged + int((alone & ~sure).sum())
+    print(f"CNR {cnr}: {far} beyond 4 sd without a flag, {flagged} of {singles} single balls flagged")
+    assert far == 0
+    assert flagged <= 0.01 * singles
