@@ -22,6 +22,7 @@ MAY_BE_MARKER: Final = 0.1  # probability from which a single image is one for a
 LOOKS_DOUBTFUL: Final = int(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)
 """Images whose size and contrast say little of their markers."""
 OBJECT_SHAPE: Final = "ball"
+_MOST_TOLD: Final = 3  # places of one film that a message lists
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,11 +188,16 @@ def lonely_images(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[
         here = np.flatnonzero(paired & (table.points.film == number))
         here = np.concatenate([here, pairing.unmatched[table.points.film[pairing.unmatched] == number]])
         chance = chance_of_marker(look[here], table.points.position_px[here], quality[here], paired[here], film.shape)
-        found += [("marker-one-view", _where(table, int(row))) for row in here[(chance > MAY_BE_MARKER) & ~paired[here]]]
+        lonely = here[(chance > MAY_BE_MARKER) & ~paired[here]]
+        if len(lonely):
+            found.append(("marker-one-view", f"{table.films[number].path.name}: {_told(table.points.position_px[lonely])}"))
     return found
 
 
-def _where(table: Readings, row: int) -> str:
-    col, line = table.points.position_px[row]
-    film = table.films[table.points.film[row]].path.name
-    return f"{film}: an image at col {col:.0f}, row {line:.0f} looks like a marker but has no partner"
+def _told(position_px: Float) -> str:
+    """Say where images lie that have no partner, of many where the first few do."""
+    places = "; ".join(f"col {col:.0f}, row {row:.0f}" for col, row in position_px[:_MOST_TOLD])
+    if len(position_px) == 1:
+        return f"an image at {places} looks like a marker but has no partner"
+    more = "; ..." if len(position_px) > _MOST_TOLD else ""
+    return f"{len(position_px)} images look like markers but have no partner: {places}{more}"

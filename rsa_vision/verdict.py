@@ -150,6 +150,7 @@ def _judge_markers(markers: Markers, limits: Limits) -> list[Finding]:
     if len(one_view):
         findings.append(("marker-one-view", f"seen from one focus only: {', '.join(map(str, one_view))}"))
     if not np.isfinite(markers.position_mm).all(axis=1).any():
-        told = "no image of one focus meets one of another: no object on the films, or films exchanged, turned, or given twice"
+        causes = "no object on the films, films exchanged, turned, or given twice, or a patient who moved"
+        told = f"no image of one focus meets one of another: {causes}"
         findings.append(("no-object-markers", told))
     return findings
