@@ -317,6 +317,14 @@ def main() -> None:
         ),
         films,
     )
+    over_bone = run(
+        (
+            ({"shape": s, "half width, px": r, "CNR": c}, Case(s, r, c, "bone", companions=True))
+            for s in ("tee", "pin")
+            for r, c in (((2.5, 20.0),) if quick else ((2.5, 50.0), (2.5, 20.0), (2.5, 10.0), (4.0, 20.0)))
+        ),
+        films,
+    )
     pairs = run(
         (
             ({"apart, diameters": a, "CNR": c}, Case("pair", 4.0, c, apart=a, companions=True, across=6))
@@ -348,6 +356,7 @@ def main() -> None:
         "Tees": pins["tee"],
         "Pins": pins["pin"],
         "Film responses (tees and pins of half width 2.5 px, balls beside)": bent,
+        "Bone (tees and pins, balls beside)": over_bone,
         "Neighbours: two balls of radius 4 px side by side": pairs,
         "Films of 4000 x 4750 pixels, one thread": clock,
         **real,
