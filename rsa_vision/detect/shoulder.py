@@ -71,8 +71,8 @@ def curve_of(film: NDArray[Any]) -> Curve:
     """
     sample = film[:: max(1, film.size // _MOST_LOOKED_AT)]
     curve = Curve(float(sample.min()), float(sample.max()), 0.0)
-    count = sample.shape[1] // _BLOCK
-    middle = medians(sample[::_BLOCK, : count * _BLOCK].reshape(-1, count, _BLOCK))  # marks are narrower than half of that
+    rows, count = sample[::_BLOCK], sample.shape[1] // _BLOCK
+    middle = medians(rows[:, : count * _BLOCK].reshape(len(rows), count, _BLOCK))  # marks are narrower than half of that
     slope, climbs = np.diff(curve.logarithm(middle)) / _BLOCK, curve.slope(middle)
     seen = np.minimum(climbs[:, 1:], climbs[:, :-1]) > _SEEN * curve.slope(np.array((curve.low + curve.high) / 2))
     return replace(curve, shading=float(np.sqrt(np.square(slope[seen]).mean())) if seen.any() else 0.0)

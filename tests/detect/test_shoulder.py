@@ -7,7 +7,7 @@ import pytest
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.noise import QUANTISATION, NoiseModel
-from rsa_vision.detect.shoulder import Curve, rounding, shown
+from rsa_vision.detect.shoulder import Curve, curve_of, rounding, shown
 from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored
@@ -54,6 +54,14 @@ def test_a_curve_shows_as_much_more_as_it_is_steeper() -> None:
     under, under_changed = _density(np.exp(light - np.log(4.0)))[0]
     more = shown(np.array([[under]]), np.array([beside]), np.array([[changed - beside]]), curve, noise)
     assert more[0, 0] == pytest.approx((under_changed - under) - (changed - beside), rel=0.1)  # the end is half a value off
+
+
+@pytest.mark.parametrize("cols", [28, 40, 70])
+def test_a_narrow_film_shows_no_shading(cols: int) -> None:
+    truth = np.array([[cols / 2, row] for row in (40.0, 100.0, 160.0)])
+    film = film_of_balls((200, cols), truth, np.full(3, 4.0), depth=0.5, noise_sd=300.0, rng=np.random.default_rng(43))
+    assert len(detect_markers(stored(film), bits=16).images) == 3
+    assert curve_of(stored(film)).shading < 0.05
 
 
 def test_films_with_more_noise_where_there_is_more_light_hide_nothing() -> None:
