@@ -12,6 +12,7 @@ from rsa_vision.types import Bool, Float
 
 ALONE = 10.0  # the same for marks of which there are not enough to tell what they are like
 _AMONG_MOTTLE = 20.0  # and those on films of which the other polarity shows nearly as much
+_QUIET = 1.25  # less variance than this around a ball, in units of the noise, is noise: chance excuses what such a ball leaves
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
 _LOST = 0.75  # of that, below which a first fit is too low for a mark
@@ -104,11 +105,14 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     pattern = _not_faint(sure & close & (fits.explained > CLOSE), height)
     radii = _sizes(fits, pattern, sigma_px)
     if len(radii) < LEAST_KNOWN:
-        # noise hides what marks are like here: those that have no company have to be clearer, and it is no excuse for what they leave
+        # noise hides what marks are like here: those without company have to be clearer, and among structure noise is no excuse
         whole = sure & (misfit(fits, noise, CHANCE) < MISFIT)  # mottle and the crossings of ribs and vessels leave more than noise
-        known = whole & (_of_like_spread(_spread(fits, sigma_px), whole) >= _COMPANY) & (not mottled)
-        alone = sure & close & (strength > (_AMONG_MOTTLE if mottled else ALONE)) & ~_soft_shadows(fits.radius_px, height, known)
-        return np.asarray(known | alone | (_like_these(known, fits, height) & (strength > max(0.5 * SURE, limit))))
+        spread = _spread(fits, sigma_px)
+        known = whole & (_of_like_spread(spread, whole) >= _COMPANY) & (not mottled)
+        fair = whole & (close | ((fits.chi2_ring < _QUIET) & (not mottled))) & ~_soft_shadows(fits.radius_px, height, known)
+        alone = fair & (strength > (_AMONG_MOTTLE if mottled else ALONE))
+        among = fair & (_of_like_spread(spread, alone) >= LEAST_KNOWN) & (not mottled)
+        return np.asarray(known | alone | among | (_like_these(known, fits, height) & (strength > max(0.5 * SURE, limit))))
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
     least = np.where(close, FAINT, UNEXCUSED)

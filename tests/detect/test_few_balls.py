@@ -34,6 +34,20 @@ def test_a_few_faint_balls_on_a_plain_film_are_found_and_nothing_else(radius_px:
     assert ratio < 1.7  # of eight coordinates, one film in a thousand
 
 
+@pytest.mark.parametrize(("radius_px", "n"), [(2.5, 4), (4.0, 3), (5.0, 1)])
+def test_noise_under_a_few_small_faint_balls_is_no_reason_to_lose_them(radius_px: float, n: int) -> None:
+    found = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        truth = np.array([[30.0, 40.0], [150.0, 60.0], [60.0, 160.0], [160.0, 150.0]])[:n] + rng.uniform(-15, 15, (n, 2))
+        noise_sd = DEPTH * BACKGROUND / 5
+        film = film_of_balls((200, 200), truth, np.full(n, radius_px), depth=DEPTH, sigma_px=1.1, noise_sd=noise_sd, rng=rng)
+        images = detect_markers(stored(film), bits=16)
+        assert len(images.images) <= n
+        found += np.count_nonzero(nearest(truth, images)[1] < 1.0) if len(images.images) else 0
+    assert found == 12 * n
+
+
 def test_noise_alone_is_no_ball() -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)
