@@ -21,6 +21,7 @@ _FITTED = 4  # parameters that ``uneven`` counts off
 _AT_RIM = 0.7  # the rim, which tells the centre, lies at half the depth; the mean of all that is under a ball at seven tenths
 _OUTLIER = 3.0  # times the median
 LEAST = 8  # marks, and places, that tell something
+_LEAST_PIXELS = 160  # under marks, of which the noise is told as well as of that many small ones
 _NOTHING = 0.01  # places leave less only where there is no noise
 _MOST = 0.4, 2.5  # what they may tell
 _WHOLE, _INSIDE = 0.95, 0.8  # of the pixels under a ball, and of its window
@@ -52,7 +53,7 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
     """
     clear = over_clutter(seeds) > SURE * np.sqrt(noise.gain(np.hypot(COARSE_SIGMA_PX, 0.5 * seeds.radius_px)))
     sure = seeds.rows(clear & (seeds.valid_fraction > _WHOLE) & (seeds.window_fraction > _INSIDE))
-    if len(sure.depth) < LEAST:
+    if not _tell_enough(sure):
         return noise
     guess = guessed_optics(float(np.median(sure.radius_px)))
     sign = np.sign(sure.depth[0])
@@ -61,7 +62,7 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
     farthest = float(np.quantile(reach, _FARTHEST))
     sure = sure.rows(reach > _FAR * farthest)
     sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
-    if farthest <= 0 or len(sure.depth) < LEAST:
+    if farthest <= 0 or not _tell_enough(sure):
         return noise
     places = free_places(film, sure, seeds.position_px, seeds.radius_px + guess.sigma_px, guess, noise)
     reach_px = float(np.median(sure.radius_px)) + guess.sigma_px
@@ -86,6 +87,10 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
         return noise
     doublings = np.interp(-usual, [-more(d) for d in _DOUBLINGS], _DOUBLINGS)
     return noise.carried_on(end + sign * farthest, 2.0**doublings)
+
+
+def _tell_enough(fits: BallFits) -> bool:
+    return float(np.pi * (fits.radius_px**2).sum()) > _LEAST_PIXELS
 
 
 def _ripple(windows: NDArray[Any], variance: Float, centre: Float | None, reach_px: Float | float) -> Float:

@@ -25,7 +25,7 @@ from rsa_vision.detect.find import (
 from rsa_vision.detect.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.patches import cut
 from rsa_vision.detect.profiles import Optics, ball_table
-from rsa_vision.types import Float, Int
+from rsa_vision.types import Bool, Float, Int
 
 SIGMAS_PX = (0.55, 0.75, 1.05, 1.5, 2.1, 2.9)
 KAPPA = 0.5  # attenuation along one blur width while the blur is looked for
@@ -41,6 +41,7 @@ _ODD = 6.0  # three times what the two numbers of the optics gain by chance
 _SETTLED = 0.3  # standard deviations
 _MOST_TRIED, _MOST_SEEDS = 40, 40
 _WHOLE, _PARTLY, _INSIDE = 0.98, 0.8, 0.8  # of the pixels under a ball, and of its window
+_SURER = 3.0  # times the significance of what is a part of another
 _SPECKS = 0.5  # of the capped significance of the best
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
@@ -78,6 +79,7 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     clear, partly = (inside & (seeds.valid_fraction > least) for least in (_WHOLE, _PARTLY))
     if partly.any():
         seeds = seeds.rows(clear if strength[clear].max(initial=0.0) > _SPECKS * strength[partly].max() else partly)
+    seeds = seeds.rows(~_within_others(seeds))
     noisy = _much_more_noise(seeds, noise)
     best = np.argsort(_closeness(seeds, noise, noisy))[:_MOST_TRIED]
     position, radius = seeds.position_px[best], seeds.radius_px[best]
@@ -204,6 +206,12 @@ def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Floa
         scatter = influence_covariance(windows, noise.correlation)
         out.spread[index] = 0.5 * np.einsum("nij,nji->n", invert(out.normal[index]), scatter)
     return out
+
+
+def _within_others(seeds: BallFits) -> Bool:
+    """Say which lie within the images of far surer ones: the slopes of large balls look like small balls, in less noise than beside them."""
+    gap = np.hypot(*(seeds.position_px[:, None] - seeds.position_px).transpose(2, 0, 1))
+    return np.asarray(((gap < seeds.radius_px) & (seeds.significance > _SURER * seeds.significance[:, None])).any(axis=1))
 
 
 def _much_more_noise(seeds: BallFits, noise: NoiseModel) -> bool:
