@@ -21,13 +21,14 @@ _FITTED = 4  # parameters that ``uneven`` counts off
 _AT_RIM = 0.7  # the rim, which tells the centre, lies at half the depth; the mean of all that is under a ball at seven tenths
 _OUTLIER = 3.0  # times the median
 LEAST = 8  # marks, and places, that tell something
-_LEAST_PIXELS = 160  # under marks, of which the noise is told as well as of that many small ones
+_LEAST_PIXELS = 40  # under marks
 _NOTHING = 0.01  # places leave less only where there is no noise
 _MOST = 0.4, 2.5  # what they may tell
 _WHOLE, _INSIDE = 0.95, 0.8  # of the pixels under a ball, and of its window
 _ASKED, _PLACES = 24, 100  # sure candidates; free places of one size, which tell more
 _QUARTILE = 0.25  # that tells: what is no ball leaves more
-_MORE = 1.3  # times the variance under them that is none by chance, and worth it
+_MORE = 0.3  # part by which the variance under them is more, that is worth it
+_BY_CHANCE = 4.5  # two standard deviations of that, of one pixel: of odd parts, and neighbours share theirs
 _DOUBLINGS = np.linspace(0.0, 5.0, 21)  # of the variance: hardly anything comes through the middle of a ball where nothing is scattered
 _FARTHEST, _FAR = 0.75, 0.5  # quantile of how far balls reach beyond the curve, and part of it from which they tell how it goes on
 
@@ -53,7 +54,7 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
     """
     clear = over_clutter(seeds) > SURE * np.sqrt(noise.gain(np.hypot(COARSE_SIGMA_PX, 0.5 * seeds.radius_px)))
     sure = seeds.rows(clear & (seeds.valid_fraction > _WHOLE) & (seeds.window_fraction > _INSIDE))
-    if not _tell_enough(sure):
+    if _pixels(sure) < _LEAST_PIXELS:
         return noise
     guess = guessed_optics(float(np.median(sure.radius_px)))
     sign = np.sign(sure.depth[0])
@@ -62,7 +63,7 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
     farthest = float(np.quantile(reach, _FARTHEST))
     sure = sure.rows(reach > _FAR * farthest)
     sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
-    if farthest <= 0 or not _tell_enough(sure):
+    if farthest <= 0 or _pixels(sure) < _LEAST_PIXELS:
         return noise
     places = free_places(film, sure, seeds.position_px, seeds.radius_px + guess.sigma_px, guess, noise)
     reach_px = float(np.median(sure.radius_px)) + guess.sigma_px
@@ -83,14 +84,14 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
         return float(np.quantile(_ripple(left, trial.variance_at(model), local, fits.radius_px + guess.sigma_px), _QUARTILE))
 
     usual = float(np.quantile(beside, _QUARTILE))
-    if more(0.0) < _MORE * usual:
+    if more(0.0) < (1 + max(_MORE, _BY_CHANCE / np.sqrt(_pixels(fits)))) * usual:
         return noise
     doublings = np.interp(-usual, [-more(d) for d in _DOUBLINGS], _DOUBLINGS)
     return noise.carried_on(end + sign * farthest, 2.0**doublings)
 
 
-def _tell_enough(fits: BallFits) -> bool:
-    return float(np.pi * (fits.radius_px**2).sum()) > _LEAST_PIXELS
+def _pixels(fits: BallFits) -> float:
+    return float(np.pi * np.square(fits.radius_px).sum())
 
 
 def _ripple(windows: NDArray[Any], variance: Float, centre: Float | None, reach_px: Float | float) -> Float:
