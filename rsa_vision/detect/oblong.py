@@ -19,16 +19,19 @@ from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Bool, Float
 
-_LEAST = 0.06  # of the radius, half the difference of the axes; two balls 0.4 diameters apart make more
+_LEAST = 0.05  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make three times that
 _SURE = 14.0  # chi2 with two degrees of freedom: one image in a thousand, if noise makes that much of an outline at all
 _MEDIAN = 1.386  # of that
+_LEAST_KNOWN = 3  # images that tell how a focal spot draws all
+_MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
+_STEP_PX = 0.1  # for derivatives
 
 
 def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> Bool:
     """Say which images are longer one way than the other, beyond what images of the film are and beyond noise and structure around.
 
-    To first order: with axes ``r + q`` and ``r - q`` the image of a ball changes by ``q cos(2 (phi - phi0))`` times its derivative by the
-    radius.
+    To first order: with second moments that differ by ``m`` between the long axis and the short one, as two images ``d`` apart have
+    ``m = d^2 / 4``, an image ``f(s)`` changes by ``m / 4 cos(2 (phi - phi0)) (f'' - f' / s)``.
 
     Parameters
     ----------
@@ -45,15 +48,18 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
     if len(balls.depth) == 0:
         return np.zeros(0, bool)
     apart, covariance = _outlines(film, balls, beside, optics, noise)
-    apart = apart - np.median(apart, axis=0)  # a focal spot draws all images alike
+    if len(apart) >= _LEAST_KNOWN:
+        apart = apart - np.median(apart, axis=0)  # a focal spot draws all images alike
     covariance = covariance * np.maximum(balls.chi2_ring, 1.0)[:, None, None]
     chance = np.einsum("ni,ni->n", apart, np.linalg.solve(covariance, apart[:, :, None])[:, :, 0])
-    chance /= max(1.0, float(np.median(chance)) / _MEDIAN)
-    return np.asarray((chance > _SURE) & (np.hypot(*apart.T) > _LEAST * balls.radius_px))
+    length = np.hypot(*apart.T) / balls.radius_px**2
+    usual = max(1.0, float(np.median(chance)) / _MEDIAN)
+    # where all images are two balls there is no usual one
+    return np.asarray((chance > _SURE) & (length > _LEAST) & ((chance > _SURE * usual) | (length > _MUCH)))
 
 
 def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
-    """Half the differences of the axes, ``q cos(2 phi0)`` and ``q sin(2 phi0)`` in px (n, 2), and their covariances."""
+    """Differences of second moments, ``m cos(2 phi0)`` and ``m sin(2 phi0)`` in px^2 (n, 2), and their covariances."""
     halves = np.array([half_size(r, optics.sigma_px) for r in balls.radius_px])
     table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
     out, covariance = np.zeros((len(halves), 2)), np.zeros((len(halves), 2, 2))
@@ -68,7 +74,11 @@ def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optic
         dx, dy = (axis - at[:, None] for axis, at in zip((cols, rows), (fits.position_px - patches.corner_px).T, strict=True))
         value, *by = slopes(table, dx, dy, fits.radius_px, optics.sigma_px)
         square = np.maximum(dx**2 + dy**2, 1e-9)
-        outline = by[2][:, None] * np.stack([(dx**2 - dy**2) / square, 2 * dx * dy / square], axis=1)
+        reach = np.sqrt(square)
+        farther = slopes(table, *(axis * (1 + _STEP_PX / reach) for axis in (dx, dy)), fits.radius_px, optics.sigma_px)[1:3]
+        falls, then = ((of[0] * dx + of[1] * dy) / reach for of in (by, farther))
+        bend = (then - falls) / _STEP_PX - falls / reach
+        outline = 0.25 * bend[:, None] * np.stack([(dx**2 - dy**2) / square, 2 * dx * dy / square], axis=1)
         surface = np.broadcast_to(polynomial(int(half), cols - half, rows - half).T, (len(index), 6, side**2))
         moves = fits.depth[:, None, None] * np.concatenate([np.stack(by, axis=1), outline], axis=1)
         images = np.concatenate([moves, value[:, None], surface], axis=1)
