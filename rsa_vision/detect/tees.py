@@ -30,6 +30,8 @@ from rsa_vision.types import Float
 _BEFORE = 1.5  # tolerance before attenuation and ends are fitted
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
+_ASIDE, _ASKEW = 0.3, 0.6  # radians by which a junction may point aside; part that arms explain which lie between those of a tee
+_TURNED = 0.2  # radians, from which a tee is not like another
 _SAME_JUNCTION = 0.5  # of the length of its arms, from a junction to the tip fitted to it
 _MOST_JUNCTIONS = 80
 _MOST_IN_VAIN = 30  # places in a row that look like a tee and are none
@@ -65,10 +67,10 @@ def find_tees(
     optics : Optics
         With the attenuation that suits the arms: they are thinner than balls, and the film curve is bent.
     """
-    models = _models(film, junctions, optics, noise)
+    models, turned = _models(film, junctions, optics, noise)
     if not models:
         return [], [], optics
-    tees = _like(film, models, optics, noise)
+    tees = _like(film, models, turned, optics, noise)
     for again in (1, MOST_TOGETHER):
         tees = _distinct(fit_all(film, tees, optics, noise, again=again), models[0])
     if not tees:
@@ -144,8 +146,8 @@ def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
     return bool(square and slim and fit.misfit < 1.3 * MISFIT * slack and explains(fit, 1 - (1 - EXPLAINED) * slack))
 
 
-def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
-    """Fit tees at the strongest junctions until a few are clean; the cleanest first, one of each size."""
+def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], list[NeedleFit]]:
+    """Fit tees at the strongest junctions until a few are clean; the cleanest first, one of each size, and those turned against it."""
     order = junctions[np.argsort(-np.abs(junctions[:, 4]))][:_MOST_JUNCTIONS]
     rough: list[NeedleFit] = []
     best_taper = TAPERS[0]
@@ -158,12 +160,18 @@ def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseMo
         tips = np.array([f.position_px for f in rough])  # what is nearly a tee of one taper is where there are tees of another
         order = order[(np.hypot(*(order[:, None, :2] - tips).transpose(2, 0, 1)) < _SAME_JUNCTION * order[:, 3:4]).any(axis=1)]
     if not rough or not is_tee(rough[0], slack=1.5):
-        return []  # crossings of other things: not one is nearly a tee
+        return [], []  # crossings of other things: not one is nearly a tee
     rough = [f for f in rough if f.shape.taper == best_taper]
     clean = [f for f in rough if is_tee(f)] or rough[:1]
     sizes = sorted(clean, key=lambda f: f.shape.length_px)
     ends = [sizes[0], sizes[-1]] if sizes[-1].shape.length_px > 1.08 * sizes[0].shape.length_px else []
-    return [clean[0], *(f for f in ends if f is not clean[0])]
+    turned = [f for f in rough if _turned(f, clean[0])]
+    return [clean[0], *(f for f in ends if f is not clean[0] and all(f is not t for t in turned))], turned
+
+
+def _turned(fit: NeedleFit, model: NeedleFit) -> bool:
+    """Say whether a tee does not look like another because it points elsewhere."""
+    return abs(math.remainder(fit.angles[0] - model.angles[0], math.tau)) > _TURNED
 
 
 def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
@@ -171,11 +179,15 @@ def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Op
     rough: list[NeedleFit] = []
     for col, row, angle, ring, _ in junctions:
         start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
-        angles = angle + np.array([0.0, np.pi / 2, -np.pi / 2])
-        fit = fit_needles(film, np.array([col, row]), angles, start, optics, noise)
-        if is_tee(fit, slack=ROUGH):
-            rough.append(fit)
-        if sum(is_tee(f) for f in rough) >= ENOUGH:
+        for turn in (0.0, _ASIDE, -_ASIDE):
+            angles = angle + turn + np.array([0.0, np.pi / 2, -np.pi / 2])
+            fit = fit_needles(film, np.array([col, row]), angles, start, optics, noise)
+            if is_tee(fit, slack=ROUGH):
+                rough.append(fit)
+            if is_tee(fit, slack=ROUGH) or fit.explained < _ASKEW:
+                break
+        clean = [f for f in rough if is_tee(f)]
+        if len(clean) >= ENOUGH and not any(_turned(f, clean[0]) for f in clean):
             break
     return sorted(rough, key=lambda f: f.misfit + 1 - f.explained)
 
@@ -185,14 +197,14 @@ def _mean_misfit(fits: list[NeedleFit]) -> float:
     return float(np.mean([f.misfit + 1 - f.explained for f in fits[:_ASKED]])) if fits else np.inf
 
 
-def _like(film: NDArray[Any], models: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
-    """Starts at every place that looks like one of the models."""
+def _like(film: NDArray[Any], models: list[NeedleFit], turned: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Look at every place that looks like one of the models, and at tees that cannot, being turned against them."""
     found = [find_like(film, template_of(m, optics)) for m in models]
     # what brighter tees hide here is found once these are known
     looks = [promising(film, places, m, optics, noise) for m, places in zip(models, found, strict=True)]
     worth, step = (np.concatenate(of) for of in zip(*looks, strict=True))
     model, places = np.repeat(np.arange(len(models)), [len(f) for f in found]), np.concatenate(found)
-    starts: list[NeedleFit] = []
+    starts = list(turned)
     free = worth
     for i in np.argsort(-places[:, 2], kind="stable"):
         if free[i]:
