@@ -165,7 +165,11 @@ def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseMo
     clean = [f for f in rough if is_tee(f)] or rough[:1]
     sizes = sorted(clean, key=lambda f: f.shape.length_px)
     ends = [sizes[0], sizes[-1]] if sizes[-1].shape.length_px > 1.08 * sizes[0].shape.length_px else []
-    turned = [f for f in rough if _turned(f, clean[0])]
+    turned: list[NeedleFit] = []
+    for fit in rough:  # the closest first: one turned by a right angle may explain much of another
+        known = [clean[0], *turned]
+        if _turned(fit, clean[0]) and _apart([fit], known, _SAME_JUNCTION * fit.shape.length_px):
+            turned.append(fit)
     return [clean[0], *(f for f in ends if f is not clean[0] and all(f is not t for t in turned))], turned
 
 
@@ -179,22 +183,27 @@ def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Op
     rough: list[NeedleFit] = []
     for col, row, angle, ring, _ in junctions:
         start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
+        tried: list[NeedleFit] = []
         for turn in (0.0, _ASIDE, -_ASIDE):
             angles = angle + turn + np.array([0.0, np.pi / 2, -np.pi / 2])
-            fit = fit_needles(film, np.array([col, row]), angles, start, optics, noise)
-            if is_tee(fit, slack=ROUGH):
-                rough.append(fit)
-            if is_tee(fit, slack=ROUGH) or fit.explained < _ASKEW:
+            tried.append(fit_needles(film, np.array([col, row]), angles, start, optics, noise))
+            if is_tee(tried[-1]) or tried[0].explained < _ASKEW:
                 break
+        rough += sorted((f for f in tried if is_tee(f, slack=ROUGH)), key=_left)[:1]
         clean = [f for f in rough if is_tee(f)]
         if len(clean) >= ENOUGH and not any(_turned(f, clean[0]) for f in clean):
             break
-    return sorted(rough, key=lambda f: f.misfit + 1 - f.explained)
+    return sorted(rough, key=_left)
+
+
+def _left(fit: NeedleFit) -> float:
+    """What the model leaves."""
+    return fit.misfit + 1 - fit.explained
 
 
 def _mean_misfit(fits: list[NeedleFit]) -> float:
     """Mean over the best few of what the model leaves; infinite for none."""
-    return float(np.mean([f.misfit + 1 - f.explained for f in fits[:_ASKED]])) if fits else np.inf
+    return float(np.mean([_left(f) for f in fits[:_ASKED]])) if fits else np.inf
 
 
 def _like(film: NDArray[Any], models: list[NeedleFit], turned: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
@@ -257,7 +266,7 @@ def _peeled(
 
 def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
-    for fit in sorted(tees, key=lambda f: f.misfit + 1 - f.explained):
+    for fit in sorted(tees, key=_left):
         deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > _FAINTEST * abs(model.depth)
         if deep and is_tee(fit, slack=ROUGH) and all(math.dist(fit.position_px, k.position_px) > NEAREST_PX for k in kept):
             kept.append(fit)
