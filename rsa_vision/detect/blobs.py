@@ -19,7 +19,7 @@ LEAST_APART = 0.7  # of the radius: nearer centres cannot be told apart with con
 LEAST_GAIN = 30.0  # twice the log-likelihood that four parameters more must gain
 STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
 _SIZES = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
-_OF_A_BLOB = 0.8  # of the radius of a ball fitted to two
+OF_A_BLOB = 0.8  # of the radius of a ball fitted to two
 _VAIN = 40  # attempts of a film that may fail
 
 
@@ -55,7 +55,7 @@ def split_blobs(
     like = balls if len(balls.depth) else blobs
     radius, depth = (float(np.median(of)) for of in (like.radius_px, np.abs(like.depth)))
     if like is blobs:
-        radius *= _OF_A_BLOB
+        radius *= OF_A_BLOB
     size = blobs.radius_px / radius
     worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (np.abs(blobs.depth) > 0.4 * depth) & (blobs.explained > 0.6)
     least = LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)

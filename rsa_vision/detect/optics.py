@@ -133,13 +133,13 @@ def _most_likely(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
             optics = _stepped(optics, step)  # so little is gained for certain
             break
         step *= min(1.0, _MOST_BY_STEP / float(np.abs(step).max()))
-        expected_before = np.square(_unexpected(optics, fits)).sum()
+        expected_before = unexpected(optics, fits)
         for _ in range(_SHORTER):
             trial = _stepped(optics, step)
             moved = fit_at(film, fits.position_px, fits.radius_px, trial, noise, quick=True)
             then = _equations(film, moved, first, halves, trial, noise)
             gain = np.clip(say * (now.left - then.left), -_ODD, _ODD)  # a fit that has gone elsewhere does not decide
-            if gain.sum() + expected_before > np.square(_unexpected(trial, moved)).sum():
+            if gain.sum() + expected_before > unexpected(trial, moved):
                 optics, fits, now = trial, moved, then
                 break
             step = step / 3
@@ -153,6 +153,21 @@ def _stepped(optics: Optics, step: Float) -> Optics:
     sigma = float(np.clip(optics.sigma_px * np.exp(step[0]), *_SIGMA_PX))
     kappa = float(np.clip(optics.mu_px * optics.sigma_px * np.exp(step[1]), *_KAPPA))
     return Optics(sigma, kappa / sigma)
+
+
+def unexpected(optics: Optics, fits: BallFits) -> float:
+    """Return minus twice the logarithm of the prior of blur and attenuation, but for a constant, given the sizes of balls.
+
+    Parameters
+    ----------
+    optics : Optics
+    fits : BallFits
+
+    Returns
+    -------
+    float
+    """
+    return float(np.square(_unexpected(optics, fits)).sum())
 
 
 def _unexpected(optics: Optics, fits: BallFits) -> Float:

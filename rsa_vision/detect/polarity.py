@@ -15,6 +15,7 @@ from rsa_vision.detect.leftover import noise_at_marks
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.optics import CAP, ball_evidence, estimate_optics
+from rsa_vision.detect.pairs import optics_of_pairs
 from rsa_vision.detect.pins import is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.detect.tees import optics_of_tees
@@ -141,6 +142,7 @@ def polarities(
             mine = mine.rows(~faint_beside(mine, slim, COARSE_SIGMA_PX, noises[sign]))
         looks[sign] = mine
         optics[sign], balls = estimate_optics(film, mine, noises[sign])
+        optics[sign], balls = optics_of_pairs(film, mine, optics[sign], noises[sign]) or (optics[sign], balls)
         strength = -sign * candidates.junctions[:, 4]
         clear = strength > CLEAR_JUNCTION
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):

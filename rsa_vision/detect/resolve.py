@@ -101,7 +101,7 @@ def resolve_balls(
     pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, tees))
     fits += pairs
     if pairs:  # a blob that two balls explain is no ball
-        good = good.rows(~_taken(good, join(pairs)))
+        good = good.rows(~_taken(good, join(pairs)) & ~_between(good, pairs))
         groups = groups_worth_fitting()
     known = good
     for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
@@ -212,6 +212,12 @@ def _taken(fits: BallFits, good: BallFits) -> Bool:
     """Say which fits lie on a ball that is already known."""
     gap = np.hypot(*(fits.position_px[:, None] - good.position_px[None]).transpose(2, 0, 1))
     return np.asarray((gap < 0.6 * good.radius_px[None]).any(axis=1))
+
+
+def _between(fits: BallFits, pairs: list[BallFits]) -> Bool:
+    """Say which fits lie on both balls of a pair: they are what one ball explains of it."""
+    gaps = [np.hypot(*(fits.position_px[:, None] - pair.position_px).transpose(2, 0, 1)) / pair.radius_px for pair in pairs]
+    return np.asarray(np.any([gap.max(axis=1) < 1.0 for gap in gaps], axis=0))
 
 
 def _like(fits: BallFits, known: BallFits) -> Bool:

@@ -39,7 +39,7 @@ def test_nothing_left_of_what_looked_like_tees_is_no_error(monkeypatch: pytest.M
         np.array([150.0, 150]), np.array([0.0, 1.5, -1.5]), NeedleShape(2.0, 16.0), np.full(3, -90.0), -90.0, 1e3, np.eye(2), 190, 1.0, 1.0,
         0.98, 1.0, 0.0, 80.0, True,
     )  # fmt: skip
-    monkeypatch.setattr(tees, "_models", lambda *_: [model])
+    monkeypatch.setattr(tees, "_models", lambda *_: ([model], []))
     monkeypatch.setattr(tees, "_like", lambda *_: [])
     optics = Optics(1.0, 0.5)
     assert find_tees(film, np.zeros((1, 5)), np.zeros((0, 6)), optics, estimate_noise(film, 16)) == ([], [], optics)

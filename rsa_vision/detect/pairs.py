@@ -1,0 +1,85 @@
+"""The blur of films on which every ball lies over another: no single one tells it, and a pair fitted as one takes any."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls import BallFits, join
+from rsa_vision.detect.blobs import LEAST_GAIN, OF_A_BLOB, STRETCH, long_axis
+from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, fit_at, misfit, plausible, refine
+from rsa_vision.detect.groups import fit_group
+from rsa_vision.detect.noise import NoiseModel
+from rsa_vision.detect.oblong import are_oblong
+from rsa_vision.detect.optics import KAPPA, SIGMAS_PX, ball_evidence, unexpected
+from rsa_vision.detect.profiles import Optics
+from rsa_vision.types import Bool, Float
+
+_ASKED = 6  # surest seeds
+_CLEAR = 2.0 * SURE  # significance
+_NEARLY = 0.6  # part of a blob that one ball explains
+_FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
+_ALIKE = 0.2  # logarithm of the radii of two balls in one
+
+
+def optics_of_pairs(film: NDArray[Any], seeds: BallFits, optics: Optics, noise: NoiseModel) -> tuple[Optics, float] | None:
+    """Estimate the blur from blobs as pairs of balls, where none of the film's surest seeds is a single one.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    seeds : BallFits
+        First looks of one polarity.
+    optics : Optics
+        As single balls would have it.
+    noise : NoiseModel
+
+    Returns
+    -------
+    optics, evidence : Optics, float
+        As of :func:`rsa_vision.detect.optics.estimate_optics`; None where there are single balls, and where no pairs are.
+    """
+    sure = seeds.rows((seeds.significance > _CLEAR) & (seeds.explained > _NEARLY))
+    sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
+    if len(sure.depth) == 0:
+        return None
+    single = fit_at(film, sure.position_px, sure.radius_px, optics, noise, quick=True)
+    close = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
+    if (close & ~are_oblong(film, single, _nothing, optics, noise)).any():
+        return None
+    blobs = [single.rows([i]) for i in range(len(single.depth))]
+
+    def left(sigma_px: float) -> float:
+        pairs = [_as_two(film, blob, sigma_px, noise) for blob in blobs]
+        of_noise = [n * np.log1p(pair.chi2_core.mean()) for n, pair in zip(single.n_core, pairs, strict=True)]
+        return float(sum(of_noise) / noise.correlation.sum()) + unexpected(Optics(sigma_px, KAPPA / sigma_px), join(pairs))
+
+    sigma = refine(SIGMAS_PX, [left(sigma) for sigma in SIGMAS_PX])
+    finer = tuple(sigma * step for step in _FINER)
+    sigma = refine(finer, [left(sigma) for sigma in finer])
+    pairs = [_as_two(film, blob, sigma, noise) for blob in blobs]
+    found = [pair for pair, blob in zip(pairs, blobs, strict=True) if _are_two(pair, blob, noise)]
+    return (Optics(sigma, KAPPA / sigma), ball_evidence(join(found), noise)) if found else None
+
+
+def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel) -> BallFits:
+    axis = long_axis(film, blob, np.sign(blob.depth[0]))
+    radius = np.full(2, OF_A_BLOB * blob.radius_px[0])
+    fits = []
+    for stretch in STRETCH:
+        starts = blob.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
+        fits.append(fit_group(film, starts, radius, sigma_px, KAPPA / sigma_px, noise))
+    return min(fits, key=lambda pair: float(pair.chi2_core.mean()))
+
+
+def _are_two(pair: BallFits, single: BallFits, noise: NoiseModel) -> bool:
+    """Say whether two balls of one size explain a blob far better than one."""
+    least = LEAST_GAIN * noise.correlation.sum() / (np.pi * single.radius_px[0] ** 2)
+    alike = abs(float(np.log(pair.radius_px[0] / pair.radius_px[1]))) < _ALIKE and pair.depth[0] * pair.depth[1] > 0
+    return bool(alike and plausible(pair, noise).all() and single.chi2_core[0] - pair.chi2_core.mean() > least)
+
+
+def _nothing(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+    return np.zeros(cols.shape), np.zeros(cols.shape, bool)
