@@ -152,7 +152,7 @@ def explained_over_noise(fits: BallFits) -> Float:
     return np.where(raised > 1.0, out, 0.0)
 
 
-def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) -> BallFits:
+def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel, slack: float = 2.5) -> BallFits:
     """Fit every candidate with guessed optics and keep what may be a ball.
 
     Parameters
@@ -160,6 +160,8 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
     film : ndarray of shape (rows, cols)
     candidates : Candidates
     noise : NoiseModel
+    slack : float
+        As of :func:`plausible`.
 
     Returns
     -------
@@ -174,7 +176,7 @@ def first_look(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) ->
         same, guess = size == k, guessed_optics(float(radius))
         parts.append(fit_at(film, candidates.position_px[same], candidates.radius_px[same], guess, noise, quick=True, sparse=True))
     fits = join(parts).rows(np.argsort(np.argsort(size, kind="stable")))
-    return fits.rows(plausible(fits, noise, slack=2.5))
+    return fits.rows(plausible(fits, noise, slack))
 
 
 def guessed_optics(radius_px: float) -> Optics:

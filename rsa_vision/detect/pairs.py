@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.blobs import LEAST_GAIN, OF_A_BLOB, STRETCH, long_axis
-from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, fit_at, misfit, plausible, refine
+from rsa_vision.detect.candidates import Candidates
+from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, distinct, first_look, fit_at, misfit, plausible, refine
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.oblong import are_oblong
@@ -17,21 +18,28 @@ from rsa_vision.detect.optics import KAPPA, SIGMAS_PX, ball_evidence, unexpected
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
-_ASKED = 6  # surest seeds
+_ASKED = 4  # surest seeds
+_STRONGEST = 24  # candidates that are asked where there is no seed
+_ANYTHING = 6.0  # times the misfit that is tolerated otherwise, which pairs leave that hardly lap
+_COARSE = 2.0  # the same of pairs at a blur that is nearly right
 _CLEAR = 2.0 * SURE  # significance
 _NEARLY = 0.6  # part of a blob that one ball explains
 _FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
 _ALIKE = 0.2  # logarithm of the radii of two balls in one
 
 
-def optics_of_pairs(film: NDArray[Any], seeds: BallFits, optics: Optics, noise: NoiseModel) -> tuple[Optics, float] | None:
+def optics_of_pairs(
+    film: NDArray[Any], candidates: Candidates, seeds: BallFits, optics: Optics, noise: NoiseModel
+) -> tuple[Optics, float, BallFits] | None:
     """Estimate the blur from blobs as pairs of balls, where none of the film's surest seeds is a single one.
 
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
+    candidates : Candidates
+        Round ones of one polarity; a pair that hardly laps is unlike any ball, so that there are no seeds of it.
     seeds : BallFits
-        First looks of one polarity.
+        First looks of that polarity.
     optics : Optics
         As single balls would have it.
     noise : NoiseModel
@@ -40,9 +48,11 @@ def optics_of_pairs(film: NDArray[Any], seeds: BallFits, optics: Optics, noise: 
     -------
     optics, evidence : Optics, float
         As of :func:`rsa_vision.detect.optics.estimate_optics`; None where there are single balls, and where no pairs are.
+    pairs : BallFits
     """
-    sure = seeds.rows((seeds.significance > _CLEAR) & (seeds.explained > _NEARLY))
-    sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
+    sure = _surest(seeds)
+    if len(sure.depth) == 0:
+        sure = _surest(distinct(first_look(film, candidates.rows(slice(_STRONGEST)), noise, slack=_ANYTHING), noise))
     if len(sure.depth) == 0:
         return None
     single = fit_at(film, sure.position_px, sure.radius_px, optics, noise, quick=True)
@@ -51,17 +61,27 @@ def optics_of_pairs(film: NDArray[Any], seeds: BallFits, optics: Optics, noise: 
         return None
     blobs = [single.rows([i]) for i in range(len(single.depth))]
 
-    def left(sigma_px: float) -> float:
-        pairs = [_as_two(film, blob, sigma_px, noise) for blob in blobs]
+    def as_two(sigma_px: float) -> list[BallFits]:
+        return [_as_two(film, blob, sigma_px, noise) for blob in blobs]
+
+    def left(pairs: list[BallFits], sigma_px: float) -> float:
         of_noise = [n * np.log1p(pair.chi2_core.mean()) for n, pair in zip(single.n_core, pairs, strict=True)]
         return float(sum(of_noise) / noise.correlation.sum()) + unexpected(Optics(sigma_px, KAPPA / sigma_px), join(pairs))
 
-    sigma = refine(SIGMAS_PX, [left(sigma) for sigma in SIGMAS_PX])
+    trials = [as_two(sigma) for sigma in SIGMAS_PX]
+    costs = [left(pairs, sigma) for pairs, sigma in zip(trials, SIGMAS_PX, strict=True)]
+    if not any(_are_two(pair, blob, noise, _COARSE) for pair, blob in zip(trials[int(np.argmin(costs))], blobs, strict=True)):
+        return None
+    sigma = refine(SIGMAS_PX, costs)
     finer = tuple(sigma * step for step in _FINER)
-    sigma = refine(finer, [left(sigma) for sigma in finer])
-    pairs = [_as_two(film, blob, sigma, noise) for blob in blobs]
-    found = [pair for pair, blob in zip(pairs, blobs, strict=True) if _are_two(pair, blob, noise)]
-    return (Optics(sigma, KAPPA / sigma), ball_evidence(join(found), noise)) if found else None
+    sigma = refine(finer, [left(as_two(sigma), sigma) for sigma in finer])
+    found = [pair for pair, blob in zip(as_two(sigma), blobs, strict=True) if _are_two(pair, blob, noise)]
+    return (Optics(sigma, KAPPA / sigma), ball_evidence(join(found), noise), distinct(join(found), noise)) if found else None
+
+
+def _surest(seeds: BallFits) -> BallFits:
+    sure = seeds.rows((seeds.significance > _CLEAR) & (seeds.explained > _NEARLY))
+    return sure.rows(np.argsort(-sure.significance)[:_ASKED])
 
 
 def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel) -> BallFits:
@@ -74,11 +94,11 @@ def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseMod
     return min(fits, key=lambda pair: float(pair.chi2_core.mean()))
 
 
-def _are_two(pair: BallFits, single: BallFits, noise: NoiseModel) -> bool:
+def _are_two(pair: BallFits, single: BallFits, noise: NoiseModel, slack: float = 1.0) -> bool:
     """Say whether two balls of one size explain a blob far better than one."""
     least = LEAST_GAIN * noise.correlation.sum() / (np.pi * single.radius_px[0] ** 2)
     alike = abs(float(np.log(pair.radius_px[0] / pair.radius_px[1]))) < _ALIKE and pair.depth[0] * pair.depth[1] > 0
-    return bool(alike and plausible(pair, noise).all() and single.chi2_core[0] - pair.chi2_core.mean() > least)
+    return bool(alike and plausible(pair, noise, slack).all() and single.chi2_core[0] - pair.chi2_core.mean() > least)
 
 
 def _nothing(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:

@@ -136,13 +136,15 @@ def polarities(
         slim = [p for p in pins if is_slim(p) and np.sign(p.depth) == sign]
         mine = seeds.rows((np.sign(seeds.depth) == sign) & ~faint_beside(seeds, slim, COARSE_SIGMA_PX, noise))
         noises[sign] = noise_at_marks(film, mine, noise)
+        round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
         if noises[sign] is not noise:  # not all that was unlike a ball in less noise is none
-            round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
             mine = distinct(_look(film, round_ones, pins, noises[sign]), noises[sign])
             mine = mine.rows(~faint_beside(mine, slim, COARSE_SIGMA_PX, noises[sign]))
         looks[sign] = mine
         optics[sign], balls = estimate_optics(film, mine, noises[sign])
-        optics[sign], balls = optics_of_pairs(film, mine, optics[sign], noises[sign]) or (optics[sign], balls)
+        if pairs := optics_of_pairs(film, round_ones, mine, optics[sign], noises[sign]):
+            optics[sign], balls, found = pairs
+            looks[sign] = distinct(join([found, mine]), noises[sign])
         strength = -sign * candidates.junctions[:, 4]
         clear = strength > CLEAR_JUNCTION
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
