@@ -75,7 +75,8 @@ def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optic
         value, *by = slopes(table, dx, dy, fits.radius_px, optics.sigma_px)
         square = np.maximum(dx**2 + dy**2, 1e-9)
         reach = np.sqrt(square)
-        farther = slopes(table, *(axis * (1 + _STEP_PX / reach) for axis in (dx, dy)), fits.radius_px, optics.sigma_px)[1:3]
+        longer = 1 + _STEP_PX / reach
+        farther = slopes(table, dx * longer, dy * longer, fits.radius_px, optics.sigma_px)[1:3]
         falls, then = ((of[0] * dx + of[1] * dy) / reach for of in (by, farther))
         bend = (then - falls) / _STEP_PX - falls / reach
         outline = 0.25 * bend[:, None] * np.stack([(dx**2 - dy**2) / square, 2 * dx * dy / square], axis=1)

@@ -224,7 +224,7 @@ def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Floa
 
 
 def _within_others(seeds: BallFits) -> Bool:
-    """Say which lie within the images of far surer ones: the slopes of large balls look like small balls, in less noise than beside them."""
+    """Say which lie within the images of far surer ones: slopes of large balls look like small balls, in less noise than beside."""
     gap = np.hypot(*(seeds.position_px[:, None] - seeds.position_px).transpose(2, 0, 1))
     return np.asarray(((gap < seeds.radius_px) & (seeds.significance > _SURER * seeds.significance[:, None])).any(axis=1))
 

@@ -11,7 +11,7 @@ from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.blobs import LEAST_GAIN, OF_A_BLOB, STRETCH, long_axis
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, distinct, first_look, fit_at, misfit, plausible, refine
-from rsa_vision.detect.groups import fit_group
+from rsa_vision.detect.groups import GroupWindow, fit_group, images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.oblong import are_oblong
 from rsa_vision.detect.optics import KAPPA, SIGMAS_PX, ball_evidence, unexpected
@@ -25,6 +25,7 @@ _COARSE = 2.0  # the same of pairs at a blur that is nearly right
 _CLEAR = 2.0 * SURE  # significance
 _NEARLY = 0.6  # part of a blob that one ball explains
 _FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
+_WIDE = 1.5  # times the radius of a blob: what is looked at of pairs
 _ALIKE = 0.2  # logarithm of the radii of two balls in one
 
 
@@ -64,9 +65,11 @@ def optics_of_pairs(
     def as_two(sigma_px: float) -> list[BallFits]:
         return [_as_two(film, blob, sigma_px, noise) for blob in blobs]
 
+    windows = [window_around(film, blob.position_px, _WIDE * blob.radius_px, optics.sigma_px, noise, None) for blob in blobs]
+
     def left(pairs: list[BallFits], sigma_px: float) -> float:
-        of_noise = [n * np.log1p(pair.chi2_core.mean()) for n, pair in zip(single.n_core, pairs, strict=True)]
-        return float(sum(of_noise) / noise.correlation.sum()) + unexpected(Optics(sigma_px, KAPPA / sigma_px), join(pairs))
+        of_noise = sum(_left(window, pair, sigma_px, noise) for window, pair in zip(windows, pairs, strict=True))
+        return of_noise / float(noise.correlation.sum()) + unexpected(Optics(sigma_px, KAPPA / sigma_px), join(pairs))
 
     trials = [as_two(sigma) for sigma in SIGMAS_PX]
     costs = [left(pairs, sigma) for pairs, sigma in zip(trials, SIGMAS_PX, strict=True)]
@@ -92,6 +95,13 @@ def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseMod
         starts = blob.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
         fits.append(fit_group(film, starts, radius, sigma_px, KAPPA / sigma_px, noise))
     return min(fits, key=lambda pair: float(pair.chi2_core.mean()))
+
+
+def _left(window: GroupWindow, pair: BallFits, sigma_px: float, noise: NoiseModel) -> float:
+    """Minus twice the log-likelihood, were the variance unknown, on the same pixels at all blurs."""
+    images = images_in(window, window.surface, pair.position_px - window.corner_px, pair.radius_px, sigma_px, KAPPA / sigma_px)
+    rest, weight = window.left_by(images.linear, noise)
+    return float(window.valid.sum() * np.log(np.maximum(weight @ rest**2, 1e-12)))
 
 
 def _are_two(pair: BallFits, single: BallFits, noise: NoiseModel, slack: float = 1.0) -> bool:

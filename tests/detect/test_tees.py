@@ -45,6 +45,15 @@ def test_nothing_left_of_what_looked_like_tees_is_no_error(monkeypatch: pytest.M
     assert find_tees(film, np.zeros((1, 5)), np.zeros((0, 6)), optics, estimate_noise(film, 16)) == ([], [], optics)
 
 
+@pytest.mark.parametrize("count", [1, 3, 9])
+def test_tees_that_point_anywhere_are_tees(count: int) -> None:
+    for seed in range(3):
+        rng = np.random.default_rng(100 * count + seed)
+        tips = rng.permutation(tips_of(rng))[:count]
+        film = exposed(light_past_tees(tips, np.ones(count), turned=rng.uniform(0, 2 * np.pi, count)), rng)
+        check(detect_markers(film, bits=16).images, tips, list(range(count)))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_blur_comes_from_clean_tees_where_crossing_arms_look_stronger(seed: int) -> None:
     rng = np.random.default_rng(seed)
