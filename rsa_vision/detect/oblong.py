@@ -21,8 +21,9 @@ from rsa_vision.types import Bool, Float
 
 _LEAST = 0.05  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make three times that
 _SURE = 14.0  # chi2 with two degrees of freedom: one image in a thousand, if noise makes that much of an outline at all
+_AMONG_OTHERS = 3.2  # the same where most images are oblong: one in five
 _MEDIAN = 1.386  # of that
-_LEAST_KNOWN = 3  # images that tell how a focal spot draws all
+_LEAST_KNOWN = 6  # images that tell how a focal spot draws all
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
 _STEP_PX = 0.1  # for derivatives
 
@@ -55,7 +56,10 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
     length = np.hypot(*apart.T) / balls.radius_px**2
     usual = max(1.0, float(np.median(chance)) / _MEDIAN)
     # where all images are two balls there is no usual one
-    return np.asarray((chance > _SURE) & (length > _LEAST) & ((chance > _SURE * usual) | (length > _MUCH)))
+    told = (chance > _SURE) & (length > _LEAST) & ((chance > _SURE * usual) | (length > _MUCH))
+    if np.count_nonzero(told) > len(told) / 2:
+        told |= (chance > _AMONG_OTHERS) & (length > _MUCH)
+    return np.asarray(told)
 
 
 def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:

@@ -18,8 +18,9 @@ from rsa_vision.detect.optics import KAPPA, SIGMAS_PX, ball_evidence, unexpected
 from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
-_ASKED = 4  # surest seeds
+_MOST = 100  # seeds among which single balls are looked for
 _STRONGEST = 24  # candidates that are asked where there is no seed
+_ASKED = 4  # surest blobs
 _ANYTHING = 6.0  # times the misfit that is tolerated otherwise, which pairs leave that hardly lap
 _COARSE = 2.0  # the same of pairs at a blur that is nearly right
 _CLEAR = 2.0 * SURE  # significance
@@ -32,7 +33,7 @@ _ALIKE = 0.2  # logarithm of the radii of two balls in one
 def optics_of_pairs(
     film: NDArray[Any], candidates: Candidates, seeds: BallFits, optics: Optics, noise: NoiseModel
 ) -> tuple[Optics, float, BallFits] | None:
-    """Estimate the blur from blobs as pairs of balls, where none of the film's surest seeds is a single one.
+    """Estimate the blur from blobs as pairs of balls, where few of the film's surest seeds are single ones.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ def optics_of_pairs(
     Returns
     -------
     optics, evidence : Optics, float
-        As of :func:`rsa_vision.detect.optics.estimate_optics`; None where there are single balls, and where no pairs are.
+        As of :func:`rsa_vision.detect.optics.estimate_optics`; None where there are single balls enough, and where no pairs are.
     pairs : BallFits
     """
     sure = _surest(seeds)
@@ -58,9 +59,10 @@ def optics_of_pairs(
         return None
     single = fit_at(film, sure.position_px, sure.radius_px, optics, noise, quick=True)
     close = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-    if (close & ~are_oblong(film, single, _nothing, optics, noise)).any():
+    alone = close & ~are_oblong(film, single, _nothing, optics, noise)
+    if np.count_nonzero(alone) >= len(alone) / 3:
         return None
-    blobs = [single.rows([i]) for i in range(len(single.depth))]
+    blobs = [single.rows([i]) for i in np.flatnonzero(~alone)[:_ASKED]]
 
     def as_two(sigma_px: float) -> list[BallFits]:
         return [_as_two(film, blob, sigma_px, noise) for blob in blobs]
@@ -84,7 +86,7 @@ def optics_of_pairs(
 
 def _surest(seeds: BallFits) -> BallFits:
     sure = seeds.rows((seeds.significance > _CLEAR) & (seeds.explained > _NEARLY))
-    return sure.rows(np.argsort(-sure.significance)[:_ASKED])
+    return sure.rows(np.argsort(-sure.significance)[:_MOST])
 
 
 def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel) -> BallFits:

@@ -142,11 +142,12 @@ def polarities(
             mine = mine.rows(~faint_beside(mine, slim, COARSE_SIGMA_PX, noises[sign]))
         looks[sign] = mine
         optics[sign], balls = estimate_optics(film, mine, noises[sign])
-        if pairs := optics_of_pairs(film, round_ones, mine, optics[sign], noises[sign]):
-            optics[sign], balls, found = pairs
-            looks[sign] = distinct(join([found, mine]), noises[sign])
         strength = -sign * candidates.junctions[:, 4]
         clear = strength > CLEAR_JUNCTION
+        pairs = None if clear.any() or slim else optics_of_pairs(film, round_ones, mine, optics[sign], noises[sign])
+        if pairs is not None:
+            optics[sign], balls, found = pairs
+            looks[sign] = distinct(join([found, mine]), noises[sign])
         if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
             optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
         elif balls < _LEAST_EVIDENCE:
