@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits
-from rsa_vision.detect.find import plausible
+from rsa_vision.detect.find import SURE, plausible
 from rsa_vision.detect.groups import fit_group
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.profiles import Optics
@@ -20,6 +20,7 @@ LEAST_GAIN = 30.0  # twice the log-likelihood that four parameters more must gai
 STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
 _SIZES = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
 OF_A_BLOB = 0.8  # of the radius of a ball fitted to two
+CLEAR, NEARLY = 2.0 * SURE, 0.6  # significance of blobs that tell, and the part of them that one ball explains
 _VAIN = 40  # attempts of a film that may fail
 
 
@@ -39,7 +40,7 @@ def split_blobs(
     blobs : BallFits
         Single fits that were turned down.
     balls : BallFits
-        Those that were not: what two balls have to be like.
+        Those that were not: what two balls have to be like. Where there are none, the surest blobs tell.
     optics : Optics
     noise : NoiseModel
     beside : callable
@@ -50,12 +51,11 @@ def split_blobs(
     list of BallFits
         Pairs that explain their blob.
     """
-    if len(blobs.depth) == 0:
+    like = balls if len(balls.depth) else blobs.rows((blobs.significance > CLEAR) & (blobs.explained > NEARLY))
+    if len(like.depth) == 0:
         return []
-    like = balls if len(balls.depth) else blobs
     radius, depth = (float(np.median(of)) for of in (like.radius_px, np.abs(like.depth)))
-    if like is blobs:
-        radius *= OF_A_BLOB
+    radius *= 1.0 if len(balls.depth) else OF_A_BLOB
     size = blobs.radius_px / radius
     worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (np.abs(blobs.depth) > 0.4 * depth) & (blobs.explained > 0.6)
     least = LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)

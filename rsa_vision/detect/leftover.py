@@ -21,7 +21,7 @@ _FITTED = 4  # parameters that ``uneven`` counts off
 _AT_RIM = 0.7  # the rim, which tells the centre, lies at half the depth; the mean of all that is under a ball at seven tenths
 _OUTLIER = 3.0  # times the median
 LEAST = 8  # marks, and places, that tell something
-_LEAST_PIXELS = 40  # under marks
+_LEAST_PIXELS, BESIDE_NEEDLES = 40.0, 300.0  # under balls; where there are pins or tees, of which some may be parts
 _NOTHING = 0.01  # places leave less only where there is no noise
 _MOST = 0.4, 2.5  # what they may tell
 _WHOLE, _INSIDE = 0.95, 0.8  # of the pixels under a ball, and of its window
@@ -33,7 +33,7 @@ _DOUBLINGS = np.linspace(0.0, 5.0, 21)  # of the variance: hardly anything comes
 _FARTHEST, _FAR = 0.75, 0.5  # quantile of how far balls reach beyond the curve, and part of it from which they tell how it goes on
 
 
-def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> NoiseModel:
+def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least_pixels: float = _LEAST_PIXELS) -> NoiseModel:
     """Return the noise with its curve carried on to the values under marks, as the film's sure candidates tell it.
 
     Where a film records the logarithm of the exposure, or anything as steep, the fewer quanta under marks make more noise than there is at
@@ -46,6 +46,8 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
     seeds : BallFits
         First looks of one polarity.
     noise : NoiseModel
+    least_pixels : float
+        Under sure candidates, from which they tell.
 
     Returns
     -------
@@ -54,7 +56,7 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
     """
     clear = over_clutter(seeds) > SURE * np.sqrt(noise.gain(np.hypot(COARSE_SIGMA_PX, 0.5 * seeds.radius_px)))
     sure = seeds.rows(clear & (seeds.valid_fraction > _WHOLE) & (seeds.window_fraction > _INSIDE))
-    if _pixels(sure) < _LEAST_PIXELS:
+    if _pixels(sure) < least_pixels:
         return noise
     guess = guessed_optics(float(np.median(sure.radius_px)))
     sign = np.sign(sure.depth[0])
@@ -63,7 +65,7 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> No
     farthest = float(np.quantile(reach, _FARTHEST))
     sure = sure.rows(reach > _FAR * farthest)
     sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
-    if farthest <= 0 or _pixels(sure) < _LEAST_PIXELS:
+    if farthest <= 0 or _pixels(sure) < least_pixels:
         return noise
     places = free_places(film, sure, seeds.position_px, seeds.radius_px + guess.sigma_px, guess, noise)
     reach_px = float(np.median(sure.radius_px)) + guess.sigma_px

@@ -55,9 +55,13 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
     chance = np.einsum("ni,ni->n", apart, np.linalg.solve(covariance, apart[:, :, None])[:, :, 0])
     length = np.hypot(*apart.T) / balls.radius_px**2
     usual = max(1.0, float(np.median(chance)) / _MEDIAN)
-    # where all images are two balls there is no usual one
-    told = (chance > _SURE) & (length > _LEAST) & ((chance > _SURE * usual) | (length > _MUCH))
-    if np.count_nonzero(told) > len(told) / 2:
+    told = (chance > _SURE) & (length > _LEAST)
+    much = told & (length > _MUCH)
+    most = np.count_nonzero(much) > len(much) / 2  # where most images are two balls there is no usual one
+    told &= chance > _SURE * usual
+    if most or len(told) < _LEAST_KNOWN:
+        told |= much
+    if most:
         told |= (chance > _AMONG_OTHERS) & (length > _MUCH)
     return np.asarray(told)
 

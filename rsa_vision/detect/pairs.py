@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls import BallFits, join
-from rsa_vision.detect.blobs import LEAST_GAIN, OF_A_BLOB, STRETCH, long_axis
+from rsa_vision.detect.blobs import CLEAR, LEAST_GAIN, NEARLY, OF_A_BLOB, STRETCH, long_axis
 from rsa_vision.detect.candidates import Candidates
-from rsa_vision.detect.find import DOUBTFUL, MISFIT, SURE, distinct, first_look, fit_at, misfit, plausible, refine
+from rsa_vision.detect.find import DOUBTFUL, MISFIT, distinct, first_look, fit_at, misfit, plausible, refine
 from rsa_vision.detect.groups import GroupWindow, fit_group, images_in, window_around
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.oblong import are_oblong
@@ -23,8 +23,6 @@ _STRONGEST = 24  # candidates that are asked where there is no seed
 _ASKED = 4  # surest blobs
 _ANYTHING = 6.0  # times the misfit that is tolerated otherwise, which pairs leave that hardly lap
 _COARSE = 2.0  # the same of pairs at a blur that is nearly right
-_CLEAR = 2.0 * SURE  # significance
-_NEARLY = 0.6  # part of a blob that one ball explains
 _FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
 _WIDE = 1.5  # times the radius of a blob: what is looked at of pairs
 _ALIKE = 0.2  # logarithm of the radii of two balls in one
@@ -85,7 +83,7 @@ def optics_of_pairs(
 
 
 def _surest(seeds: BallFits) -> BallFits:
-    sure = seeds.rows((seeds.significance > _CLEAR) & (seeds.explained > _NEARLY))
+    sure = seeds.rows((seeds.significance > CLEAR) & (seeds.explained > NEARLY))
     return sure.rows(np.argsort(-sure.significance)[:_MOST])
 
 

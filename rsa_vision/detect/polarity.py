@@ -11,7 +11,7 @@ from rsa_vision.detect.balls import BallFits, join
 from rsa_vision.detect.candidates import Candidates
 from rsa_vision.detect.decide import faint_beside
 from rsa_vision.detect.find import COARSE_SIGMA_PX, ROUNDNESS, STRENGTH, distinct, first_look
-from rsa_vision.detect.leftover import noise_at_marks
+from rsa_vision.detect.leftover import BESIDE_NEEDLES, noise_at_marks
 from rsa_vision.detect.needle_images import NeedleFit
 from rsa_vision.detect.noise import NoiseModel
 from rsa_vision.detect.optics import CAP, ball_evidence, estimate_optics
@@ -135,16 +135,17 @@ def polarities(
         # by mottle no blur of pins is told
         slim = [p for p in pins if is_slim(p) and np.sign(p.depth) == sign]
         mine = seeds.rows((np.sign(seeds.depth) == sign) & ~faint_beside(seeds, slim, COARSE_SIGMA_PX, noise))
-        noises[sign] = noise_at_marks(film, mine, noise)
+        strength = -sign * candidates.junctions[:, 4]
+        clear = strength > CLEAR_JUNCTION
+        needles = bool(clear.any() or slim)
+        noises[sign] = noise_at_marks(film, mine, noise, *[BESIDE_NEEDLES] * needles)
         round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
         if noises[sign] is not noise:  # not all that was unlike a ball in less noise is none
             mine = distinct(_look(film, round_ones, pins, noises[sign]), noises[sign])
             mine = mine.rows(~faint_beside(mine, slim, COARSE_SIGMA_PX, noises[sign]))
         looks[sign] = mine
         optics[sign], balls = estimate_optics(film, mine, noises[sign])
-        strength = -sign * candidates.junctions[:, 4]
-        clear = strength > CLEAR_JUNCTION
-        pairs = None if clear.any() or slim else optics_of_pairs(film, round_ones, mine, optics[sign], noises[sign])
+        pairs = None if needles else optics_of_pairs(film, round_ones, mine, optics[sign], noises[sign])
         if pairs is not None:
             optics[sign], balls, found = pairs
             looks[sign] = distinct(join([found, mine]), noises[sign])

@@ -98,7 +98,8 @@ def resolve_balls(
     clean[asked] = ~are_oblong(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, tees, *at), optics, noise)
     sure = single.rows(clean)
     blobs = single.rows(~clean & ~_taken(single, sure))
-    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, tees))
+    split = len(sure.depth) > 0 or needles is None  # else what arms leave is all there is
+    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, tees)) if split else []
     fits += pairs
     if pairs:  # a blob that two balls explain is no ball
         good = good.rows(~_taken(good, join(pairs)) & ~_between(good, pairs))
