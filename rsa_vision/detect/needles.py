@@ -17,6 +17,7 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 _STEPS = 14
+_DEEPER = 2.0  # times the height of its image: a depth beyond that is what thin opacity would come to, and no measure
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
 _CLOSE_PX = 0.1
 _MOVES = 5  # tip, half width, length, direction
@@ -155,6 +156,7 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
     depth = float(fit.depths.mean())
     core = under(image)
     n_core = int(core.sum())
+    high = min(abs(depth), _DEEPER * float(np.abs(image).max(initial=0.0)))
     left = float(square[core].sum())
     raised = float((weight * (residual + image) ** 2)[core].sum())
     chi2_core = left / n_core if n_core else np.inf
@@ -167,7 +169,7 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
         valid_fraction=min(1.0, n_core / max(whole, 1.0)),
         chi2_core=chi2_core,
         explained=1.0 - left / max(raised, 1e-12),
-        misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(abs(depth), 1e-9)),
+        misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(high, 1e-9)),
         significance=significance_of(image, surface, weight),
     )
 

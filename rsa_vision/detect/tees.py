@@ -168,7 +168,7 @@ def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseMo
     turned: list[NeedleFit] = []
     for fit in rough:  # the closest first: one turned by a right angle may explain much of another
         known = [clean[0], *turned]
-        if _turned(fit, clean[0]) and _apart([fit], known, _SAME_JUNCTION * fit.shape.length_px):
+        if is_tee(fit, slack=_BEFORE) and _turned(fit, clean[0]) and _apart([fit], known, _SAME_JUNCTION * fit.shape.length_px):
             turned.append(fit)
     return [clean[0], *(f for f in ends if f is not clean[0] and all(f is not t for t in turned))], turned
 
