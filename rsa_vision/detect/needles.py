@@ -17,7 +17,8 @@ from rsa_vision.detect.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 _STEPS = 14
-_DEEPER = 2.0  # times the height of its image: a depth beyond that is what thin opacity would come to, and no measure
+# times the height of an image: a depth beyond that is what thin opacity would come to, and no measure; no metal is thinner than that
+_DEEPER, _DEEPEST = 2.0, 30.0
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
 _CLOSE_PX = 0.1
 _MOVES = 5  # tip, half width, length, direction
@@ -156,7 +157,8 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
     depth = float(fit.depths.mean())
     core = under(image)
     n_core = int(core.sum())
-    high = min(abs(depth), _DEEPER * float(np.abs(image).max(initial=0.0)))
+    peak = float(np.abs(image).max(initial=0.0))
+    high = min(abs(depth), _DEEPER * peak) if abs(depth) < _DEEPEST * peak else 0.0
     left = float(square[core].sum())
     raised = float((weight * (residual + image) ** 2)[core].sum())
     chi2_core = left / n_core if n_core else np.inf
