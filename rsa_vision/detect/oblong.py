@@ -19,7 +19,7 @@ from rsa_vision.detect.profiles import Optics, ball_table
 from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Bool, Float
 
-_LEAST = 0.05  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make three times that
+_LEAST = 0.08  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make twice that
 _SURE = 14.0  # chi2 with two degrees of freedom: one image in a thousand, if noise makes that much of an outline at all
 _AMONG_OTHERS = 3.2  # the same where most images are oblong: one in five
 _MEDIAN = 1.386  # of that

@@ -145,7 +145,7 @@ def polarities(
             mine = mine.rows(~faint_beside(mine, slim, COARSE_SIGMA_PX, noises[sign]))
         looks[sign] = mine
         optics[sign], balls = estimate_optics(film, mine, noises[sign])
-        pairs = None if needles else optics_of_pairs(film, round_ones, mine, optics[sign], noises[sign])
+        pairs = None if clear.any() else optics_of_pairs(film, round_ones, mine, optics[sign], noises[sign])
         if pairs is not None:
             optics[sign], balls, found = pairs
             looks[sign] = distinct(join([found, mine]), noises[sign])

@@ -48,6 +48,32 @@ def test_noise_under_a_few_small_faint_balls_is_no_reason_to_lose_them(radius_px
     assert found == 12 * n
 
 
+@pytest.mark.parametrize("n", [1, 3, 5])
+@pytest.mark.parametrize(("radius_px", "cnr"), [(5.0, 20.0), (8.0, 10.0), (12.0, 10.0), (12.0, 20.0)])
+@pytest.mark.parametrize("log", [False, True])
+def test_a_few_large_soft_balls_in_the_noise_of_quanta(log: bool, radius_px: float, cnr: float, n: int) -> None:
+    """Where little comes through there is less noise on a linear film, and more on one of the logarithm of the exposure."""
+    z2: list[float] = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        places = np.array([[60.0, 60.0], [190.0, 70.0], [70.0, 190.0], [200.0, 200.0], [130.0, 130.0]])
+        truth = rng.permutation(places + rng.uniform(-10, 10, places.shape))[:n]
+        light = film_of_balls((260, 260), truth, np.full(n, radius_px), background=1.0, depth=0.85, sigma_px=0.3 * radius_px)
+        high = -np.log(light.min()) if log else 1 - light.min()
+        light = np.maximum(rng.poisson(light * (cnr / high) ** 2) / (cnr / high) ** 2, 0.01)
+        images = detect_markers(stored(30000 - 9000 * np.log(light) if log else 30000 * light), bits=16).images
+        gap = np.hypot(*(truth[:, None] - images.position_px).transpose(2, 0, 1))
+        near = gap.min(axis=1, initial=99.0) < 1.5
+        assert len(images) <= n
+        index = gap.argmin(axis=1)[near] if len(images) else np.zeros(0, int)
+        error, covariance = images.position_px[index] - truth[near], images.covariance_px2[index]
+        z2 += np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).tolist()
+    ratio = float(np.sqrt(np.mean(z2) / 2))
+    print(f"log {log}, radius {radius_px}, CNR {cnr}: {len(z2)} of {4 * n}, error / sd {ratio:.2f}")
+    assert len(z2) >= (4 * n if n > 1 or not log else 1)  # one ball alone tells its noise badly
+    assert ratio < 1.6 + 0.4 * (n == 1)
+
+
 def test_noise_alone_is_no_ball() -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)
