@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,8 @@ from rsa_vision.types import Bool, Float
 
 _MOST = 100  # seeds among which single balls are looked for
 _STRONGEST = 24  # candidates that are asked where there is no seed
-_ASKED = 4  # surest blobs
+_FEW = 8  # of the seeds, asked first
+_ASKED, _AT_FIRST = 4, 2  # surest blobs; those asked while the blur is anybody's
 _ANYTHING = 6.0  # times the misfit that is tolerated otherwise, which pairs leave that hardly lap
 _COARSE = 2.0  # the same of pairs at a blur that is nearly right
 _FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
@@ -55,25 +57,27 @@ def optics_of_pairs(
         sure = _surest(distinct(first_look(film, candidates.rows(slice(_STRONGEST)), noise, slack=_ANYTHING), noise))
     if len(sure.depth) == 0:
         return None
-    single = fit_at(film, sure.position_px, sure.radius_px, optics, noise, quick=True)
-    close = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-    alone = close & ~are_oblong(film, single, _nothing, optics, noise)
-    if np.count_nonzero(alone) >= len(alone) / 3:
-        return None
+    for some in (sure.rows(slice(_FEW)), sure):  # mostly a few are enough
+        single = fit_at(film, some.position_px, some.radius_px, optics, noise, quick=True)
+        close = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
+        alone = close & ~are_oblong(film, single, _nothing, optics, noise)
+        if np.count_nonzero(alone) >= len(alone) / 3:
+            return None
     blobs = [single.rows([i]) for i in np.flatnonzero(~alone)[:_ASKED]]
 
-    def as_two(sigma_px: float) -> list[BallFits]:
-        return [_as_two(film, blob, sigma_px, noise) for blob in blobs]
+    def as_two(sigma_px: float, *, rough: bool = False) -> list[BallFits]:
+        first, stretches = (blobs[:_AT_FIRST], STRETCH[:1]) if rough else (blobs, STRETCH)
+        return [_as_two(film, blob, sigma_px, noise, stretches) for blob in first]
 
     windows = [window_around(film, blob.position_px, _WIDE * blob.radius_px, optics.sigma_px, noise, None) for blob in blobs]
 
     def left(pairs: list[BallFits], sigma_px: float) -> float:
-        of_noise = sum(_left(window, pair, sigma_px, noise) for window, pair in zip(windows, pairs, strict=True))
+        of_noise = sum(_left(window, pair, sigma_px, noise) for window, pair in zip(windows, pairs, strict=False))
         return of_noise / float(noise.correlation.sum()) + unexpected(Optics(sigma_px, KAPPA / sigma_px), join(pairs))
 
-    trials = [as_two(sigma) for sigma in SIGMAS_PX]
+    trials = [as_two(sigma, rough=True) for sigma in SIGMAS_PX]
     costs = [left(pairs, sigma) for pairs, sigma in zip(trials, SIGMAS_PX, strict=True)]
-    if not any(_are_two(pair, blob, noise, _COARSE) for pair, blob in zip(trials[int(np.argmin(costs))], blobs, strict=True)):
+    if not any(_are_two(pair, blob, noise, _COARSE) for pair, blob in zip(trials[int(np.argmin(costs))], blobs, strict=False)):
         return None
     sigma = refine(SIGMAS_PX, costs)
     finer = tuple(sigma * step for step in _FINER)
@@ -87,11 +91,11 @@ def _surest(seeds: BallFits) -> BallFits:
     return sure.rows(np.argsort(-sure.significance)[:_MOST])
 
 
-def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel) -> BallFits:
+def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel, stretches: Sequence[float]) -> BallFits:
     axis = long_axis(film, blob, np.sign(blob.depth[0]))
     radius = np.full(2, OF_A_BLOB * blob.radius_px[0])
     fits = []
-    for stretch in STRETCH:
+    for stretch in stretches:
         starts = blob.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
         fits.append(fit_group(film, starts, radius, sigma_px, KAPPA / sigma_px, noise))
     return min(fits, key=lambda pair: float(pair.chi2_core.mean()))
