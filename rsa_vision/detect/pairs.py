@@ -63,7 +63,10 @@ def optics_of_pairs(
         alone = close & ~are_oblong(film, single, _nothing, optics, noise)
         if np.count_nonzero(alone) >= len(alone) / 3:
             return None
-    blobs = [single.rows([i]) for i in np.flatnonzero(~alone)[:_ASKED]]
+    rest = ~alone & np.isfinite(single.position_px).all(axis=1)
+    if not rest.any():
+        return None
+    blobs = [single.rows([i]) for i in np.flatnonzero(rest)[:_ASKED]]
 
     def as_two(sigma_px: float, *, rough: bool = False) -> list[BallFits]:
         first, stretches = (blobs[:_AT_FIRST], STRETCH[:1]) if rough else (blobs, STRETCH)
