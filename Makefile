@@ -10,7 +10,7 @@ demo: $(STAMP)  ## a small synthetic study, rendered and measured, with its repo
 	$(BIN)/rsa-vision demo demo
 
 test: $(STAMP)  ## one worker a processor, each with one thread: more of them get in the way
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -21,8 +21,10 @@ from rsa_vision.detect.whitening import whiten_rows
 from rsa_vision.types import Float
 
 _STEPS = 25
-_CONVERGED_PX = 1e-3
+_CONVERGED_PX = 5e-3  # a step's change: the last step leaves far less
 _MOST_PX, _LAST_PX = 0.5, 1.0  # of a step; of the last one, which is not held near: from farther off no straight line leads there
+_MOST_RADII = 0.12  # of a step, of large balls
+_ARRIVED = 12  # steps after which what still takes the longest ones is nowhere near
 _LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
 _MOST_BENT = 1.0  # half windows to a radius
 KNOTS = 1.5  # blur widths between the knots of a profile across an edge
@@ -79,23 +81,25 @@ def fit_group(
         images = images_in(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     ground: Float | None = None
-    converged, before = False, np.zeros((3, k))
+    converged, lost, before = False, False, np.zeros((3, k))
+    most = max(_MOST_PX, _MOST_RADII * float(radius.min()))
     for step in range(_STEPS + 1):
         value, linear, jac = images.value, images.linear, images.jacobian(theta)
         residual = data - linear @ theta
-        if step == _STEPS or converged:
+        if step == _STEPS or converged or lost:
             break
         if step in (4, 10):
             weight = valid / noise.variance_at(linear @ theta + window.neighbours)
         delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 6 else 1e-7)
         move = delta[: 3 * k].reshape(3, k)
-        scale = min(1.0, _MOST_PX / max(float(np.abs(move).max()), 1e-9))
+        farthest = float(np.abs(move).max())
+        scale = min(1.0, most / max(farthest, 1e-9))
         if (move * before).sum() < 0:  # too far: without this faint pairs go to and fro for ever
             scale *= 0.5
         before = move
         local = local + scale * move[:2].T
         radius = np.clip(radius + scale * move[2], low, high)
-        converged = step > 2 and float(np.abs(move).max()) < _CONVERGED_PX
+        converged, lost = step > 2 and farthest < _CONVERGED_PX, step >= _ARRIVED and farthest > most
         if edge:
             if taken:
                 ground = _under(images.value, surface @ theta[k : k + surface.shape[1]])

@@ -22,7 +22,7 @@ from rsa_vision.types import Bool, Float, Int
 Images = Callable[[Float, Float], Float]
 """Images of some marks at pixels (cols, rows), in film values over the background."""
 _Key = tuple[float, float, float, Optics]  # of a table: half width, length, taper
-CELL = 0.3  # pixels between the nodes of a needle table
+CELL, CELL_OF_BLUR = 0.3, 0.4  # pixels between the nodes of a needle table, and part of the blur where that is more
 GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
 _LOG_GRID = math.log(GRID)
@@ -110,8 +110,9 @@ def _opacity(
     A ray in depth ``z`` of the needle crosses it at the distance ``s + sqrt(slant) z`` from the tip; of its chord only the part before the
     flat end counts. The middle of the chord lies the further behind the further it is from the axis: ``skew`` times the distance.
     """
+    cell = _cell(optics.sigma_px)
     first, (n_s, n_p) = _grid(half_width, length, optics.sigma_px)
-    cell_s, cell_p = CELL * longer, CELL * wider
+    cell_s, cell_p = cell * longer, cell * wider
     s = first[0] * longer + cell_s * np.arange(n_s)
     # without skew one half; the other is its mirror image
     p = first[1] * wider + cell_p * np.arange(n_p) if skew else cell_p * np.arange(n_p // 2 + 1)
@@ -149,9 +150,14 @@ def film_curve(opacity: Float, curve: tuple[float, float]) -> Float:
 
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
     """Return where the grid of a table begins along and across the needle, and how many nodes it has."""
-    pad = _PAD * sigma
-    half = math.ceil((half_width + pad) / CELL)
-    return (-pad, -half * CELL), (math.ceil((length + 2 * pad) / CELL) + 1, 2 * half + 1)
+    pad, cell = _PAD * sigma, _cell(sigma)
+    half = math.ceil((half_width + pad) / cell)
+    return (-pad, -half * cell), (math.ceil((length + 2 * pad) / cell) + 1, 2 * half + 1)
+
+
+def _cell(sigma: float) -> float:
+    """Return the pixels between the nodes of a table: nothing changes within a part of the blur."""
+    return max(CELL, CELL_OF_BLUR * sigma)
 
 
 @lru_cache(maxsize=1024)
@@ -161,7 +167,7 @@ def _table_for(
     """Return the key of the table for about this size, where its grid begins and, in cells, its middle and how far it is seen."""
     half_width, length, sigma = round(GRID**width_step, 4), round(GRID**length_step, 4), round(optics.sigma_px, 3)
     first, (n_s, n_p) = _grid(half_width, length, sigma)
-    middle, rim = ((n_s - 1) / 2, (n_p - 1) / 2), (_PAD - _FADED) * sigma / CELL
+    middle, rim = ((n_s - 1) / 2, (n_p - 1) / 2), (_PAD - _FADED) * sigma / _cell(sigma)
     curve = round(optics.curve[0], 3), round(optics.curve[1], 3)
     near = Optics(sigma, round(optics.mu_px, 4), curve, round(optics.tail, 3))
     return (half_width, length, round(taper, 3), near), first, middle, (middle[0] - rim, middle[1] - rim)
@@ -183,7 +189,7 @@ def _table(half_width: float, length: float, taper: float, optics: Optics, slant
     ]
     if more == "ends":
         nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
-    nodes += np.gradient(base, CELL)
+    nodes += np.gradient(base, _cell(optics.sigma_px))
     if more == "optics":
         factor = float(np.exp(STEP))
         dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
@@ -248,9 +254,10 @@ def arm_images(
     if not slopes:
         return seen.spread([value])
     more_w, more_l, *more, g_s, g_p = more
-    along, across = (seen.at_s + seen.first[0] / CELL) * seen.cell_s, (seen.at_p + seen.first[1] / CELL) * seen.cell_p
+    cell = _cell(seen.key[3].sigma_px)
+    along, across = (seen.at_s + seen.first[0] / cell) * seen.cell_s, (seen.at_p + seen.first[1] / cell) * seen.cell_p
     c, s = np.cos(angles)[seen.arm], -np.sin(angles)[seen.arm]
-    g_s, g_p = g_s * (CELL / seen.cell_s), g_p * (CELL / seen.cell_p)
+    g_s, g_p = g_s * (cell / seen.cell_s), g_p * (cell / seen.cell_p)
     d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
     by_size = [more_w - g_p * across / shape.half_width_px, more_l - g_s * along / shape.length_px]
     return seen.spread([value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more])
@@ -283,10 +290,11 @@ class _Seen:
     def of(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> _Seen:
         steps = (math.floor(math.log(size) / _LOG_GRID) for size in (shape.half_width_px, shape.length_px))
         key, first, middle, reach = _table_for(*steps, shape.taper, optics)
-        cell_s, cell_p = CELL * shape.length_px / key[1], CELL * shape.half_width_px / key[0]
+        cell = _cell(key[3].sigma_px)
+        cell_s, cell_p = cell * shape.length_px / key[1], cell * shape.half_width_px / key[0]
         c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
-        at_s = dx * (c / cell_s) + (dy * (s / cell_s) - first[0] / CELL)
-        at_p = dy * (c / cell_p) - (dx * (s / cell_p) + first[1] / CELL)
+        at_s = dx * (c / cell_s) + (dy * (s / cell_s) - first[0] / cell)
+        at_p = dy * (c / cell_p) - (dx * (s / cell_p) + first[1] / cell)
         within = (np.abs(at_s - middle[0]) < reach[0]) & (np.abs(at_p - middle[1]) < reach[1])
         index = np.flatnonzero(within)
         at = at_s.ravel().take(index), at_p.ravel().take(index)

@@ -11,14 +11,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import i0e
 
-from rsa_vision.types import Float
+from rsa_vision.types import Bool, Float, Int
 
 TAIL = 2.4  # times the blur, of the wider part of the light
 REACH = 6.0  # blur widths beyond the rim at which the image has faded (exp(-18))
 _Y_MIN, _Y_MAX = 0.4, 22.0  # r / sigma covered by the tables
 _X_STEP, _Y_STEP = 0.04, 0.02  # of rho / sigma, and of log(r / sigma), in the fine tables
+_ROWS = 16  # of a fine table that are made at once: the balls of a film need few, and a film has attenuations of its own
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 
@@ -58,11 +60,17 @@ class BallTable:
 
     Attributes
     ----------
+    coarse : ndarray of shape (k, m)
+        Opacity (0..1) on the coarse grid.
     nodes : ndarray of shape (3, ny, nx), single precision
-        Opacity (0..1), and its derivatives by rho/sigma and by r/sigma.
+        Opacity, and its derivatives by rho/sigma and by r/sigma, where they have been asked for.
+    made : ndarray of bool, shape (ny // _ROWS + 1,)
+        Which rows that is.
     """
 
-    nodes: Float
+    coarse: Float
+    nodes: NDArray[np.float32]
+    made: Bool
 
     def evaluate(self, x: Float, y: Float) -> tuple[Float, Float, Float]:
         """Interpolate the table bilinearly.
@@ -83,6 +91,8 @@ class BallTable:
         row = np.clip((np.log(y) - np.log(_Y_MIN)) / _Y_STEP, 0, ny - 1.001)
         top = row.astype(np.intp)
         frac = (row - top).astype(self.nodes.dtype)[:, None]
+        if not self.made[top // _ROWS].all():
+            self._make(np.unique(top // _ROWS))
         # one blended row for every ball, then a look-up along rho only: half the work of a two-dimensional look-up for each pixel
         col = np.minimum(x * kind.type(1 / _X_STEP), kind.type(nx - 1.001))
         left = col.astype(np.intp)
@@ -98,6 +108,15 @@ class BallTable:
         rise -= near
         value, d_rho, d_radius = near + part * rise
         return value, d_rho, d_radius
+
+    def _make(self, blocks: Int) -> None:
+        of_y, by_y = _blur().along_y
+        of_x, by_x = _blur().along_x
+        for block in blocks[~self.made[blocks]].tolist():
+            rows = slice(block * _ROWS, (block + 1) * _ROWS + 1)
+            seen = of_y[rows] @ self.coarse
+            self.nodes[:, rows] = seen @ of_x.T, seen @ by_x.T, by_y[rows] @ self.coarse @ of_x.T
+            self.made[block] = True
 
 
 @lru_cache(maxsize=64)
@@ -116,9 +135,8 @@ def ball_table(mu_sigma: float) -> BallTable:
     blur = _blur()
     opacity = -np.expm1(-2 * mu_sigma * blur.half_chord)
     coarse = np.matmul(blur.kernel, (opacity * blur.weight)[:, :, None])[:, :, 0]
-    of_y, by_y = blur.along_y
-    of_x, by_x = blur.along_x
-    return BallTable(np.array([of_y @ coarse @ of_x.T, of_y @ coarse @ by_x.T, by_y @ coarse @ of_x.T], np.float32))
+    n_y, n_x = (len(of) for of, _ in (blur.along_y, blur.along_x))
+    return BallTable(coarse, np.zeros((3, n_y, n_x), np.float32), np.zeros(n_y // _ROWS + 1, bool))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
