@@ -12,30 +12,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls import BallFits, join
-from rsa_vision.detect.beside import images_beside, lapping_balls
-from rsa_vision.detect.candidates import Candidates, find_candidates
-from rsa_vision.detect.decide import are_balls, faint_beside
-from rsa_vision.detect.find import MISFIT, STRENGTH, fit_at, plausible, significance_limit
-from rsa_vision.detect.leftover import noise_under
-from rsa_vision.detect.mixed import part
-from rsa_vision.detect.needle_images import NeedleFit
-from rsa_vision.detect.needle_sets import is_located, on_arms
-from rsa_vision.detect.noise import NoiseModel, estimate_noise
-from rsa_vision.detect.oblong import are_oblong
-from rsa_vision.detect.painted import paint
-from rsa_vision.detect.pins import MOST_STROKES, find_pins, look_for_pins
-from rsa_vision.detect.polarity import first_looks, is_mottled, off_pins, polarities
-from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.resolve import resolve_balls
-from rsa_vision.detect.response import BITS, high_balls, in_film_values, is_straighter, log_odds
-from rsa_vision.detect.rims import goes_on
-from rsa_vision.detect.second_look import look_again
-from rsa_vision.detect.settle import STRUCTURE, settle
-from rsa_vision.detect.strokes import at_junctions
-from rsa_vision.detect.surroundings import free_places
-from rsa_vision.detect.table import WHOLE, table_of, what_is_left
-from rsa_vision.detect.tees import find_tees, is_tee
+from rsa_vision.detect.balls.decide import are_balls, faint_beside
+from rsa_vision.detect.balls.find import MISFIT, STRENGTH, fit_at, plausible, significance_limit
+from rsa_vision.detect.balls.fits import BallFits, join
+from rsa_vision.detect.balls.leftover import noise_under
+from rsa_vision.detect.balls.surroundings import free_places
+from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
+from rsa_vision.detect.marks.mixed import part
+from rsa_vision.detect.marks.polarity import first_looks, is_mottled, off_pins, polarities
+from rsa_vision.detect.marks.resolve import resolve_balls
+from rsa_vision.detect.marks.response import BITS, high_balls, in_film_values, is_straighter, log_odds
+from rsa_vision.detect.marks.second_look import look_again
+from rsa_vision.detect.marks.settle import STRUCTURE, settle
+from rsa_vision.detect.marks.table import WHOLE, table_of, what_is_left
+from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.painted import paint
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.pins import MOST_STROKES, find_pins, look_for_pins
+from rsa_vision.detect.needles.sets import is_located, on_arms
+from rsa_vision.detect.needles.tees import find_tees, is_tee
+from rsa_vision.detect.neighbours.beside import images_beside, lapping_balls
+from rsa_vision.detect.neighbours.oblong import are_oblong
+from rsa_vision.detect.neighbours.rims import goes_on
+from rsa_vision.detect.search.candidates import Candidates, find_candidates
+from rsa_vision.detect.search.strokes import at_junctions
 from rsa_vision.threads import in_one_thread
 from rsa_vision.types import Bool, Float, MarkerImages
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rsa_vision.detect.alike import true_spread
+from rsa_vision.detect.balls.alike import true_spread
 
 TRIALS = 400
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.foreign import foreign, in_line
+from rsa_vision.detect.neighbours.foreign import foreign, in_line
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Float
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsa_vision.detect.groups import fit_group
-from rsa_vision.detect.noise import estimate_noise
+from rsa_vision.detect.film.noise import estimate_noise
+from rsa_vision.detect.neighbours.groups import fit_group
 
 from .films import stored
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
-from rsa_vision.detect.needle_images import NeedleShape, arm_images, film_curve
-from rsa_vision.detect.profiles import Optics
+from rsa_vision.detect.models.needles import NeedleShape, arm_images, film_curve
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin
 

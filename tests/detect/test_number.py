@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsa_vision.detect.balls import BallFits
-from rsa_vision.detect.resolve import doubt_of_number
+from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.detect.marks.resolve import doubt_of_number
 
 
 def balls(cols: list[float], significance: list[float]) -> BallFits:

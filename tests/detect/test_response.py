@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rsa_vision.detect import _detect, detect_markers
-from rsa_vision.detect.find import significance_limit
-from rsa_vision.detect.noise import NoiseModel, estimate_noise
-from rsa_vision.detect.response import in_film_values, log_odds
+from rsa_vision.detect.balls.find import significance_limit
+from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
+from rsa_vision.detect.marks.response import in_film_values, log_odds
 from rsa_vision.types import Float, MarkerImages
 
 from .films import film_of_balls, grid_of_balls, stored

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.usual import proportion
+from rsa_vision.detect.balls.usual import proportion
 from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored

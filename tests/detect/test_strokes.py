@@ -4,7 +4,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.strokes import where_three_meet
+from rsa_vision.detect.search.strokes import where_three_meet
 from synthetic.chords import chord_pin
 
 SIDE, PITCH_MM, MU_PER_MM, FINE = 500, 0.0625, 8.0, 4

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.find import fit_at
-from rsa_vision.detect.noise import estimate_noise
-from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.table import table_of, what_is_left
+from rsa_vision.detect.balls.find import fit_at
+from rsa_vision.detect.film.noise import estimate_noise
+from rsa_vision.detect.marks.table import table_of, what_is_left
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.flags import MarkerFlag
 
 from .films import film_of_balls, grid_of_balls, stored

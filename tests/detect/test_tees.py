@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect import detect_markers, shared, tees
-from rsa_vision.detect.candidates import find_candidates
-from rsa_vision.detect.find import STRENGTH
-from rsa_vision.detect.needle_images import NeedleFit, NeedleShape
-from rsa_vision.detect.noise import estimate_noise
-from rsa_vision.detect.profiles import Optics
-from rsa_vision.detect.tees import find_tees, is_tee, optics_of_tees
-from rsa_vision.detect.whitening import Filter
+from rsa_vision.detect import detect_markers
+from rsa_vision.detect.balls.find import STRENGTH
+from rsa_vision.detect.film.noise import estimate_noise
+from rsa_vision.detect.film.whitening import Filter
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles import shared, tees
+from rsa_vision.detect.needles.tees import find_tees, is_tee, optics_of_tees
+from rsa_vision.detect.search.candidates import find_candidates
 from rsa_vision.types import Float
 
 from .test_covered import CELLS, SIDE, SIGMA_PX, check, exposed, light_past_tees, tips_of

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.unlike import too_pale
+from rsa_vision.detect.balls.unlike import too_pale
 from rsa_vision.flags import MarkerFlag
 
 from .films import film_of_balls, grid_of_balls, stored

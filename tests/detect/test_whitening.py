@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.noise import LAGS, NoiseModel
-from rsa_vision.detect.whitening import Filter, whiten
+from rsa_vision.detect.film.noise import LAGS, NoiseModel
+from rsa_vision.detect.film.whitening import Filter, whiten
 from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored

@@ -1,0 +1,85 @@
+"""What is unlike the other marks of a film: of a size of its own, or paler than they are wherever they lie."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rsa_vision.detect.balls.alike import SD_OF_MAD
+from rsa_vision.detect.balls.decide import LEAST_KNOWN
+from rsa_vision.types import Bool, Float
+
+COMPANY = 6  # marks of one kind that tell what is unlike them
+_ALIKE, _APART = 0.035, 3.0  # of radii of one kind, where curve and background differ; standard deviations
+_BESIDE = 5  # known balls nearest in background, on either side
+_SCATTERED = 0.6  # the part of one and the same film value that is primary radiation differs by no more: from 0.5 to 0.8 of it
+_CHANCE = 2.0  # standard deviations of two depths, each
+
+
+def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> Bool:
+    """Say which have a size that hardly another of the film has, where there are enough of one size: dots of letters, screw tips.
+
+    Parameters
+    ----------
+    size_px, variance_px2 : ndarray of shape (n,)
+        Radii of the balls of a film, or half widths of its pins or tees; their variances.
+    alike : float
+        Standard deviation of the logarithms of the sizes of one kind.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    size, variance = np.log(size_px), variance_px2 / size_px**2
+    apart = np.abs(size[:, None] - size) / np.sqrt(variance[:, None] + variance + alike**2)
+    company = (apart < _APART).sum(axis=1)
+    return np.asarray((company < LEAST_KNOWN) & (company.max(initial=0) >= COMPANY))
+
+
+def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:
+    """Say which balls are paler than those of the film on darker and on lighter values let expect: staples, letters, tips of screws.
+
+    What balls of one metal take away goes with the light that there is and the gradient of the film: on linear films with the value, on
+    others with an arch over the values, highest where the film is steepest. Between two others in background, then, a ball is at least as
+    deep as the chord between them, but for scattered light, noise, and what the film's balls scatter by in this very figure. Of several
+    neighbours on one side the deepest one stands for marks: a row of staples has more corners than there are balls beside it.
+
+    Parameters
+    ----------
+    depth, variance : ndarray of shape (n,)
+        Depths of balls, without sign, and their variances.
+    background : ndarray of shape (n,)
+    known : ndarray of bool, shape (n,)
+        Nothing speaks against these as yet.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None where too few are known.
+    """
+    doubt = _CHANCE * np.sqrt(variance)
+    pale = np.zeros(len(depth), bool)
+    while True:
+        marks = known & ~pale
+        usual = np.array([_between(depth - doubt, background, marks, i) for i in range(len(depth))])
+        told = marks & (usual > 0)
+        if np.count_nonzero(told) < COMPANY:
+            return pale
+        part = np.log(depth[told] / usual[told])
+        middle = float(np.median(part))
+        spread = SD_OF_MAD * float(np.median(np.abs(part - middle)))
+        paler = depth + doubt < min(_SCATTERED, np.exp(middle - _APART * spread)) * usual
+        if not (paler & ~pale).any():
+            return pale
+        pale |= paler
+
+
+def _between(depth: Float, background: Float, marks: Bool, i: int) -> float:
+    """Depth that a mark has at least on a background between those of others; 0 where it lies between none."""
+    offset = background - background[i]
+    others = marks & (np.arange(len(depth)) != i)
+    sides = [np.flatnonzero(others & side) for side in (offset <= 0, offset > 0)]
+    if min(len(side) for side in sides) == 0:
+        return 0.0
+    nearest = [side[np.argsort(np.abs(offset[side]), kind="stable")[:_BESIDE]] for side in sides]
+    ends = [side[np.argmax(depth[side])] for side in nearest]
+    return max(float(np.interp(0.0, offset[ends], depth[ends])), 0.0)

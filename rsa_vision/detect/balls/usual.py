@@ -1,0 +1,109 @@
+"""What the balls of a film have in common: their size, and how their depth goes with the background."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsa_vision.detect.balls.alike import SD_OF_MAD, true_spread
+from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.types import Float
+
+_ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
+_LEAST_BALLS = 5  # whose depths tell how they go with the background
+_LEAST_VALUE = 1.0  # of a film
+_OUTLIER = 3.0
+_FEW = 0.25  # clear balls to one that is fitted with an edge, from which they do not tell which sizes are usual
+_LEAST_SIZES = 3  # balls that tell which sizes there are
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Radii of a film's balls.
+
+    Attributes
+    ----------
+    log_radius, spread : float
+        Mean and standard deviation of the logarithm of the radius in pixels.
+    """
+
+    log_radius: float
+    spread: float
+
+    @property
+    def radius_px(self) -> float:
+        """Usual radius."""
+        return float(np.exp(self.log_radius))
+
+    @property
+    def radius_sd_px(self) -> float:
+        """By how much radii differ from it."""
+        return self.spread * self.radius_px
+
+
+def usual_size(clear: BallFits) -> Size:
+    """Return the size of these balls, with what they truly differ by."""
+    centre, spread, _ = true_spread(np.log(clear.radius_px), clear.covariance[:, 2, 2] / clear.radius_px**2)
+    return Size(centre, min(spread, _ANYTHING))
+
+
+def size_unlike(balls: BallFits, clear: BallFits) -> Float:
+    """Return by how much the radii of balls differ from the nearest ones of clear balls, squared, beyond what errors explain; shape (n,).
+
+    What pulls at a radius, as a corner or a second edge beside a ball does, pulls at its centre as much. Where clear balls are few, as
+    those in nearly saturated film beside a limb full of structure, what most of the others are like is usual as well.
+    """
+    if len(clear.depth) < _LEAST_SIZES:
+        return np.zeros(len(balls.depth))
+    gap = np.square(balls.radius_px[:, None] - clear.radius_px)
+    more = np.maximum(gap - balls.covariance[:, None, 2, 2] - clear.covariance[:, 2, 2], 0.0).min(axis=1)
+    if len(clear.depth) < _FEW * len(balls.depth):
+        gap = np.square(balls.radius_px - np.median(balls.radius_px))
+        more = np.minimum(more, np.maximum(gap - balls.covariance[:, 2, 2], 0.0))
+    return np.asarray(more)
+
+
+@dataclass(frozen=True, slots=True)
+class Proportion:
+    """Change of a ball's depth with the background, both in film values, and its standard deviation."""
+
+    slope: float
+    sd: float
+
+
+def proportion(depth: Float, background: Float, beside: Float) -> Proportion:
+    """Tell how depths go with the background: not at all on logarithmic films, like it on linear ones.
+
+    The fits' own backgrounds have errors that are those of the depths with the other sign. Values farther off have not, and go with the
+    backgrounds all the same: they are the instrument of the regression (Wright, 1928), by their ranks. The prior is centred on none and as
+    wide as a linear film's.
+
+    Parameters
+    ----------
+    depth, background : ndarray of shape (n,)
+        Of clear balls.
+    beside : ndarray of shape (n,)
+        Values of the film beside them.
+
+    Returns
+    -------
+    Proportion
+    """
+    if len(depth) == 0:
+        return Proportion(0.0, 0.0)
+    of_linear = abs(float(np.median(depth))) / max(abs(float(np.median(background))), _LEAST_VALUE)
+    if len(depth) < _LEAST_BALLS:
+        return Proportion(0.0, of_linear)
+    rank = np.argsort(np.argsort(beside)) - 0.5 * (len(beside) - 1)
+    middle = float(np.median(depth))
+    far = _OUTLIER * SD_OF_MAD * float(np.median(np.abs(depth - middle)))
+    depth = np.clip(depth, middle - far, middle + far)
+    shared = float(rank @ background)
+    if shared <= 0:
+        return Proportion(0.0, of_linear)
+    slope = float(rank @ depth) / shared
+    left = depth - depth.mean() - slope * (background - background.mean())
+    error = float(np.sqrt(left @ left / (len(left) - 2) * (rank @ rank))) / shared
+    drawn = 1 + (error / of_linear) ** 2
+    return Proportion(slope / drawn, error / np.sqrt(drawn))

@@ -1,0 +1,1 @@
+"""What a film is like: its noise, what its curve hides, and windows cut from it."""

@@ -1,0 +1,103 @@
+"""Square windows of a film as one array, with the weights that mask what is not to be fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
+
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.types import Bool, Float, Int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    """Windows of equal size around marker candidates.
+
+    Attributes
+    ----------
+    values : ndarray of shape (n, s, s)
+        Film values, float64.
+    valid : ndarray of bool, shape (n, s, s)
+        False outside the film and where the film is saturated.
+    corner_px : ndarray of int, shape (n, 2)
+        (col, row) of the first pixel of each window.
+    """
+
+    values: Float
+    valid: Bool
+    corner_px: Int
+
+    @property
+    def size(self) -> int:
+        """Side of the windows in pixels."""
+        return int(self.values.shape[1])
+
+
+def cut(film: NDArray[Any], centres_px: Float, half: int, noise: NoiseModel) -> Patches:
+    """Cut windows of ``2 half + 1`` pixels around rounded centres.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    centres_px : ndarray of shape (n, 2)
+        (col, row).
+    half : int
+    noise : NoiseModel
+        Says which values are saturated.
+
+    Returns
+    -------
+    Patches
+    """
+    corner = np.rint(centres_px).astype(np.int64) - half
+    side = 2 * half + 1
+    if len(corner) and corner.min() >= 0 and (corner.max(0) + side <= film.shape[::-1]).all():
+        values = np.array([film[row : row + side, col : col + side] for col, row in corner.tolist()], np.float64)
+        return Patches(values, (values > noise.floor) & (values < noise.ceiling), corner)
+    step = np.arange(side)
+    cols = corner[:, 0, None] + step
+    rows = corner[:, 1, None] + step
+    inside_c = (cols >= 0) & (cols < film.shape[1])
+    inside_r = (rows >= 0) & (rows < film.shape[0])
+    values = film[np.clip(rows, 0, film.shape[0] - 1)[:, :, None], np.clip(cols, 0, film.shape[1] - 1)[:, None, :]].astype(np.float64)
+    valid = inside_r[:, :, None] & inside_c[:, None, :] & (values > noise.floor) & (values < noise.ceiling)
+    return Patches(values, valid, corner)
+
+
+def columns(blocks: list[Float]) -> Float:
+    """Put blocks of rows of shape (k, n) beside each other as the columns of a design matrix (n, p), each in one piece in memory."""
+    return np.concatenate(blocks).T
+
+
+def weighted_least_squares(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
+    """Return one damped Gauss-Newton step: the weighted least-squares solution with columns scaled to one.
+
+    Parameters
+    ----------
+    jac : ndarray of shape (n, p)
+    weight, target : ndarray of shape (n,)
+    damping : float
+        Relative to the scaled diagonal; keeps what the pixels do not determine where it is.
+
+    Returns
+    -------
+    ndarray of shape (p,)
+    """
+    root = np.sqrt(weight)
+    weighted = jac * root[:, None]
+    return damped_solution(weighted.T @ weighted, weighted.T @ (root * target), damping)
+
+
+def damped_solution(normal: Float, right: Float, damping: float) -> Float:
+    """Solve normal equations whose columns are scaled to one, ``damping`` added to the scaled diagonal."""
+    scale = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
+    scaled = normal / (scale[:, None] * scale)
+    scaled.ravel()[:: len(scale) + 1] += damping
+    *_, solution, fails = dgesv(scaled, right / scale)  # numpy's own does the same in twice the time
+    if fails:
+        raise np.linalg.LinAlgError("singular normal equations")
+    return np.asarray(solution / scale)

@@ -1,0 +1,126 @@
+"""A ball on an arm of a tee: neither is one alone, together they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from rsa_vision.detect.balls.equations import polynomial
+from rsa_vision.detect.balls.find import plausible
+from rsa_vision.detect.balls.fits import BallFits, ball_image
+from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.film.patches import cut
+from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.crossing import fit_crossing
+from rsa_vision.detect.neighbours.groups import fit_group
+from rsa_vision.types import Float
+
+_ROUNDS = 5
+_STEP_PX = 0.01  # for differences of the ball's image
+
+
+def part(
+    film: NDArray[Any],
+    tee: NeedleFit,
+    balls: BallFits,
+    optics: Optics,
+    tee_optics: Optics,
+    noise: NoiseModel,
+    beside: Callable[[Float, Float], Float],
+    is_tee: Callable[[NeedleFit], bool],
+) -> tuple[NeedleFit, BallFits] | None:
+    """Take a tee and a ball on it apart.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    tee : NeedleFit
+        That does not fit well enough alone.
+    balls : BallFits
+        Those of the film that stand alone: what the ball has to be like.
+    optics, tee_optics : Optics
+    noise : NoiseModel
+    beside : callable
+        Images of all other marks at pixels (cols, rows).
+    is_tee : callable
+
+    Returns
+    -------
+    (NeedleFit, BallFits) or None
+        None where the two do not explain it.
+    """
+    if len(balls.depth) == 0:
+        return None
+    radius, depth = float(np.median(balls.radius_px)), float(np.median(balls.depth))
+
+    def without_tee(cols: Float, rows: Float) -> Float:
+        dx, dy = cols - tee.position_px[0], rows - tee.position_px[1]
+        return beside(cols, rows) + needle_image(dx, dy, tee, tee_optics)
+
+    def without_ball(cols: Float, rows: Float) -> Float:
+        dx, dy = (cols - ball.position_px[0, 0]).reshape(1, -1), (rows - ball.position_px[0, 1]).reshape(1, -1)
+        image = ball.depth[0] * ball_image(dx, dy, ball.radius_px, optics.sigma_px, optics.mu_px).reshape(cols.shape)
+        total: Float = beside(cols, rows) + image
+        return total
+
+    place = _brightest_rest(film, tee, np.sign(depth), without_tee)
+    ball = fit_group(film, place[None], np.array([radius]), optics.sigma_px, optics.mu_px, noise, without_tee)
+    for _ in range(_ROUNDS):
+        tee = fit_crossing(film, [tee], tee_optics, noise, others=without_ball, steps=6)[0]
+        ball = fit_group(film, ball.position_px, ball.radius_px, optics.sigma_px, optics.mu_px, noise, without_tee)
+    alike = abs(np.log(ball.radius_px[0] / radius)) < 0.25 and 0.4 < ball.depth[0] / depth < 2.5
+    if not (alike and plausible(ball, noise).all() and is_tee(tee)):
+        return None
+    of_tee, of_ball = _joint_covariance(film, tee, ball, optics, tee_optics, noise)
+    excess = max(1.0, tee.chi2_core, float(ball.chi2_core[0]))
+    return replace(tee, covariance_px2=excess * of_tee), replace(ball, covariance=excess * of_ball[None])
+
+
+def _joint_covariance(
+    film: NDArray[Any], tee: NeedleFit, ball: BallFits, optics: Optics, tee_optics: Optics, noise: NoiseModel
+) -> tuple[Float, Float]:
+    """Covariances of the tip (col, row) and of the ball (col, row, radius, depth) when both are free at once."""
+    half = int(np.ceil(1.2 * tee.shape.length_px + np.abs(tee.position_px - ball.position_px[0]).max() + 6))
+    patch = cut(film, tee.position_px[None], half, noise)
+    rows, cols = np.mgrid[0 : patch.size, 0 : patch.size].reshape(2, -1).astype(np.float64) + patch.corner_px[0][::-1, None]
+    dx, dy = cols - tee.position_px[0], rows - tee.position_px[1]
+    arms, *moves, turn = arm_images(dx, dy, tee.angles, tee.shape, tee_optics)
+    (x, y), radius, depth = ball.position_px[0], ball.radius_px[0], ball.depth[0]
+
+    def image(x: float, y: float, radius: float) -> Float:
+        at = ((cols - x)[None], (rows - y)[None])
+        value: Float = ball_image(*at, np.array([radius]), optics.sigma_px, optics.mu_px)[0]
+        return value
+
+    h = _STEP_PX
+    by_ball = [image(x + h, y, radius) - image(x - h, y, radius), image(x, y + h, radius) - image(x, y - h, radius)]
+    by_ball += [image(x, y, radius + h) - image(x, y, radius - h)]
+    columns = [tee.depths @ m for m in moves] + [tee.depths @ turn, arms.sum(0)]
+    n_tee = len(columns)
+    columns += [depth * b / (2 * h) for b in by_ball] + [image(x, y, radius)]
+    near = (np.hypot(dx, dy) < half) & patch.valid[0].ravel()
+    jac = np.column_stack([*columns, polynomial(half, dx, dy)]) * near[:, None]
+    sd = np.sqrt(noise.variance_at(patch.values[0].ravel()))
+    weighted = jac / sd[:, None]
+    covariance = np.linalg.pinv(weighted.T @ weighted, hermitian=True)
+    wanted = [0, 1, n_tee, n_tee + 1, n_tee + 2, n_tee + 3]
+    whole = influence_covariance((covariance[wanted] @ weighted.T).reshape(6, patch.size, patch.size), noise.correlation)
+    return whole[:2, :2], whole[2:, 2:]
+
+
+def _brightest_rest(film: NDArray[Any], tee: NeedleFit, sign: float, model: Callable[[Float, Float], Float]) -> Float:
+    """Place (col, row) near a tee where most is left over once the tee is taken away."""
+    reach = int(np.ceil(tee.shape.length_px + 8))
+    col, row = np.rint(tee.position_px).astype(np.intp)
+    top, left = max(row - reach, 0), max(col - reach, 0)
+    window = film[top : row + reach + 1, left : col + reach + 1].astype(np.float64)
+    rows, cols = np.mgrid[top : top + window.shape[0], left : left + window.shape[1]].astype(np.float64)
+    rest = sign * gaussian_filter(window - model(cols, rows), 2.0)
+    best = np.unravel_index(int(rest.argmax()), rest.shape)
+    return np.array([cols[best], rows[best]])

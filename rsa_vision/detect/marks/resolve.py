@@ -1,0 +1,282 @@
+"""Which candidates are balls: fits with the film's own optics, neighbours fitted together, one decision for all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, hopeless, look_clear
+from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
+from rsa_vision.detect.balls.fits import BallFits, join
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.models.painted import Painted
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, Background, all_but, deep_at, groups_of, images_beside, lapping_balls
+from rsa_vision.detect.neighbours.blobs import split_blobs
+from rsa_vision.detect.neighbours.crowds import resolve_crowds
+from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
+from rsa_vision.detect.neighbours.groups import fit_group
+from rsa_vision.detect.neighbours.lines import without_lines
+from rsa_vision.detect.neighbours.oblong import are_oblong
+from rsa_vision.detect.neighbours.spots import find_spot, with_spot
+from rsa_vision.detect.search.candidates import Candidates
+from rsa_vision.types import Bool, Float
+
+_LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
+_LIKE = 0.35  # logarithm of the radius, against the film's median
+
+
+def resolve_balls(
+    film: NDArray[Any],
+    candidates: Candidates,
+    seeds: BallFits,
+    limit: float,
+    optics: Optics,
+    noise: NoiseModel,
+    needles: Painted | None,
+) -> tuple[BallFits, Bool, Bool, Bool]:
+    """Fit all balls of a film.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    candidates : Candidates
+        Of the markers' polarity.
+    seeds : BallFits
+        First looks of that polarity.
+    limit : float
+        Significance that a mark must have.
+    optics : Optics
+    noise : NoiseModel
+    needles : Painted, optional
+        Images of pins and tees, to be subtracted.
+
+    Returns
+    -------
+    fits : BallFits
+        Those that are balls.
+    touching : ndarray of bool, shape (n,)
+        Fitted together with a neighbour, or perhaps two.
+    edged : ndarray of bool, shape (n,)
+        Fitted together with an edge.
+    drawn : ndarray of bool, shape (n,)
+        Fitted with the film's focal spot.
+    """
+    worth = ~hopeless(seeds, COARSE_SIGMA_PX, noise)
+    if needles is not None and np.count_nonzero(look_clear(seeds, noise)) >= LEAST_KNOWN:  # else these too are asked what balls are like
+        worth &= ~needles.explain(film, seeds.position_px, seeds.radius_px)
+    seeds = seeds.rows(worth)
+    if len(seeds.depth) == 0:
+        return seeds, np.zeros(0, bool), np.zeros(0, bool), np.zeros(0, bool)
+    tees: Background | None = needles
+    others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
+    single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
+    clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
+    drawn, spot, in_doubt = find_spot(film, single.rows(~clean), single.rows(clean & look_clear(single, noise)), optics, noise, others)
+    if spot is not None:
+        rest = ~_taken(single, drawn)
+        single, clean, tees = single.rows(rest), clean[rest], with_spot(tees, drawn, spot, optics)
+    good = single.rows(plausible(single, noise, slack=1.5))
+
+    def groups_worth_fitting() -> list[list[int]]:
+        worth = promising(good, limit, optics.sigma_px, noise) & ~hopeless(good, optics.sigma_px, noise)
+        return [g for g in groups_of(good, optics) if worth[g].any()]
+
+    groups, fits = groups_worth_fitting(), []
+    clear = look_clear(good, noise)
+    like = good.rows(clear) if np.count_nonzero(clear) >= LEAST_KNOWN else good
+    for members in _unexplained_pairs(film, candidates, good, like, optics, tees):
+        pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
+        fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
+    clean &= ~perhaps_two(single, single.rows(clean), noise)
+    asked = clean & promising(single, limit, optics.sigma_px, noise) & ~hopeless(single, optics.sigma_px, noise)
+    one_each = single.rows(asked)
+    clean[asked] = ~are_oblong(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, tees, *at), optics, noise)
+    sure = single.rows(clean)
+    blobs = single.rows(~clean & ~_taken(single, sure))
+    split = len(sure.depth) > 0 or needles is None  # else what arms leave is all there is
+    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, tees)) if split else []
+    fits += pairs
+    if pairs:  # a blob that two balls explain is no ball
+        good = good.rows(~_taken(good, join(pairs)) & ~_between(good, pairs))
+        groups = groups_worth_fitting()
+    known = good
+    for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
+        index = np.array(g)
+        if 1 < len(g) <= MOST_IN_GROUP:
+            near = all_but(known, index, optics, tees)
+            fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, near))
+        elif len(g) > MOST_IN_GROUP:
+            fits.append(_peel(film, good.rows(index), optics, noise, tees))
+    alone = np.array([g[0] for g in groups if len(g) == 1], dtype=np.intp)
+    if len(alone):
+
+        def neighbours(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+            return images_beside(known, alone[[i]], optics, tees, cols, rows)
+
+        fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
+    found = join([single.rows(slice(0)), *fits])
+    found = found.rows(~_cancelled(found))
+    found = found.rows(inside(found, film) & ~_taken(found, drawn))
+    balls = plausible(found, noise)
+    alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
+    perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
+    found = found.rows(~_bar(found, misfit(found, noise) < DOUBTFUL * MISFIT))
+    found = resolve_crowds(film, candidates, distinct(found, noise), optics, noise, tees)
+    found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
+    found = without_lines(film, distinct(found, noise), limit, optics, noise, tees)
+    found, edged = beside_edges(film, found, optics, noise, tees)
+    balls = plausible(found, noise)
+    found, edged = found.rows(balls), edged[balls]
+    by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)
+    found, edged = join([found, drawn]), np.append(edged, np.zeros(len(drawn.depth), bool))
+    touching = np.zeros(len(found.depth), bool)
+    for g in groups_of(found, optics):
+        touching[g] = len(g) > 1
+    touching[by_spot] |= in_doubt
+    return found, touching, edged, by_spot
+
+
+def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
+    """Say which balls may be two: larger than the film's known ones, and less like a ball than those.
+
+    Parameters
+    ----------
+    fits, known : BallFits
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None where fewer than three are known.
+    """
+    if len(known.depth) < LEAST_KNOWN:
+        return np.zeros(len(fits.depth), bool)
+    known = known.rows(np.argsort(known.chi2_core)[: max(LEAST_KNOWN, len(known.depth) // 4)])  # the others may be two themselves
+    left = misfit(fits, noise)
+    unlike = (
+        (left > _UNLIKE * np.median(misfit(known, noise))) & (left > _LEAST_UNLIKE) & (fits.chi2_core > 1 + 5 * noise.scatter(fits.n_core))
+    )
+    return np.asarray(unlike & (fits.radius_px > _LARGER * np.median(known.radius_px)))
+
+
+def _in_one_beam(fits: BallFits) -> Bool:
+    """Say whose shadow lies over that of another ball."""
+    return np.asarray((lapping_balls(fits) & ~np.eye(len(fits.depth), dtype=bool)).any(axis=1))
+
+
+def _bar(fits: BallFits, close: Bool) -> Bool:
+    """Say which of those in one beam are no balls: two explain much, so they must explain it closely; between two that do not is a bar."""
+    partners = lapping_balls(fits) & ~np.eye(len(fits.depth), dtype=bool)
+    return np.asarray((partners.any(axis=1) & ~close) | ((partners & ~close).sum(axis=1) > 1))
+
+
+def _cancelled(fits: BallFits) -> Bool:
+    """Say over which lies one of the other polarity: together they may explain anything."""
+    return np.asarray((lapping_balls(fits) & (np.sign(fits.depth)[:, None] != np.sign(fits.depth))).any(axis=1))
+
+
+def doubt_of_number(fits: BallFits) -> Float:
+    """Return the variances that three or more lapping balls have because they may be one fewer, shape (n, 2, 2), px^2.
+
+    Where one of them is faint, two in a row of three could have come from one between them: half their distance from where it is.
+
+    Parameters
+    ----------
+    fits : BallFits
+
+    Returns
+    -------
+    ndarray of shape (n, 2, 2)
+        Zero for single balls, for pairs, and where all are beyond doubt.
+    """
+    out = np.zeros((len(fits.depth), 2, 2))
+    if len(out) == 0:
+        return out
+    lapping: Any = lapping_balls(fits)
+    _, label = connected_components(csr_array(lapping), directed=False)
+    for k in np.flatnonzero(np.bincount(label) > 2):
+        members = np.flatnonzero(label == k)
+        if fits.significance[members].min() < SURE:
+            apart = fits.position_px[members][:, None] - fits.position_px[members]
+            nearest = (np.hypot(*apart.transpose(2, 0, 1)) + 1e9 * np.eye(len(members))).argmin(axis=1)
+            half = 0.5 * apart[np.arange(len(members)), nearest]
+            out[members] = half[:, :, None] * half[:, None]
+    return out
+
+
+def _taken(fits: BallFits, good: BallFits) -> Bool:
+    """Say which fits lie on a ball that is already known."""
+    gap = np.hypot(*(fits.position_px[:, None] - good.position_px[None]).transpose(2, 0, 1))
+    return np.asarray((gap < 0.6 * good.radius_px[None]).any(axis=1))
+
+
+def _between(fits: BallFits, pairs: list[BallFits]) -> Bool:
+    """Say which fits lie on both balls of a pair: they are what one ball explains of it."""
+    gaps = [np.hypot(*(fits.position_px[:, None] - pair.position_px).transpose(2, 0, 1)) / pair.radius_px for pair in pairs]
+    return np.asarray(np.any([gap.max(axis=1) < 1.0 for gap in gaps], axis=0))
+
+
+def _like(fits: BallFits, known: BallFits) -> Bool:
+    """Say which balls of a group are like those of the film that stand alone: two blobs can explain much that is none."""
+    size = np.abs(np.log(fits.radius_px / np.median(known.radius_px))) < _LIKE
+    apart = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(size))
+    size = size & (apart.min(1, initial=99.0) > 0.4 * fits.radius_px)  # two nearly in one place share its depth between them anyhow
+    return np.asarray(
+        size & (np.sign(fits.depth) == np.sign(np.median(known.depth))) & (np.abs(fits.depth) > 0.4 * np.median(np.abs(known.depth)))
+    )
+
+
+def inside(fits: BallFits, film: NDArray[Any]) -> Bool:
+    """Say which centres lie on the film."""
+    col, row = fits.position_px.T
+    return np.asarray((col > -0.5) & (row > -0.5) & (col < film.shape[1] - 0.5) & (row < film.shape[0] - 0.5))
+
+
+def _unexplained_pairs(
+    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, optics: Optics, tees: Background | None
+) -> list[Float]:
+    """Starts of groups, rows of (col, row, radius), at peaks off all known balls; ``like`` says what a ball is like on this film."""
+    if len(good.depth) == 0:
+        return []
+    typical = float(np.median(like.radius_px))
+    fine = np.nonzero(candidates.radius_px <= 3.0)[0] if typical < 6 else np.arange(len(candidates.strength))
+    peaks = candidates.position_px[fine]
+    if len(peaks) == 0:
+        return []
+    peaks = peaks[deep_at(film, peaks, typical, tees) > 0.4 * np.median(np.abs(like.depth))]
+    if len(peaks) == 0:
+        return []
+    gaps = np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1))
+    free = (gaps > np.maximum(0.6 * typical, 0.9 * good.radius_px)).all(1)
+    out = []
+    used = np.zeros(len(peaks), bool)
+    for i in np.nonzero(free)[0]:
+        if used[i]:
+            continue
+        gap = np.hypot(*(peaks - peaks[i]).T)
+        company = np.nonzero((gap < 2 * typical + TOUCH * optics.sigma_px) & (gap > 0.6 * typical) & free & ~used)[0]
+        company = company[np.argsort(gap[company])][: MOST_IN_GROUP - 1]
+        known = good.position_px[np.hypot(*(good.position_px - peaks[i]).T) < 2 * typical + TOUCH * optics.sigma_px]
+        if len(company) + len(known) == 0 or len(company) > 3:
+            continue
+        starts = np.concatenate([peaks[[i]], peaks[company], known])[:MOST_IN_GROUP]
+        used[[i, *company]] = True
+        out.append(np.column_stack([starts, np.full(len(starts), typical)]))
+    return out[:200]
+
+
+def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
+    """Fit a large crowd one by one, each with the images of all others subtracted, until they settle."""
+    for _ in range(4):
+        last = fits
+
+        def others(i: int, cols: Float, rows: Float, last: BallFits = last) -> tuple[Float, Bool]:
+            return images_beside(last, np.array([i]), optics, tees, cols, rows)[0], np.zeros(cols.shape, bool)
+
+        fits = fit_at(film, fits.position_px, fits.radius_px, optics, noise, others)
+    return fits

@@ -1,0 +1,271 @@
+"""The last fit of balls: on a background that goes on under them as the film goes on beside them.
+
+With noise alone a fit on a quadratic background is the best there is. Bone bends further under a ball, where no residual shows it,
+and pulls at the centre. How much of it there is, and how fine, free places around the ball tell (`surroundings.py`); with that as
+their variance the coefficients of further surfaces are fitted as well (least squares with random effects: Henderson, Biometrics 31,
+1975). A mark takes away its part of that background, on a linear film more where there is more: left out, the slope of a bone pulls
+at the centres of large balls. The radius is held near what the balls of the film have in common, as far as they do. The same
+estimator, held over the free places, shows what errors are left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.decide import EDGE
+from rsa_vision.detect.balls.equations import polynomial
+from rsa_vision.detect.balls.find import CHANCE
+from rsa_vision.detect.balls.fits import BallFits, slopes, uneven_white
+from rsa_vision.detect.balls.random_effects import Common, Solution, Windows, hold, solve, variance_of
+from rsa_vision.detect.balls.surroundings import Modes, Places, around_each, mean_beside, modes, texture
+from rsa_vision.detect.balls.usual import proportion, size_unlike, usual_size
+from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.film.patches import cut
+from rsa_vision.detect.film.shoulder import Curve, curve_of, shown, unseen_slope
+from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.neighbours.beside import Beside
+from rsa_vision.detect.neighbours.edges import OF_SHIFT
+from rsa_vision.detect.neighbours.foreign import foreign, in_line, robust_residual
+from rsa_vision.detect.neighbours.specks import Specks, find_specks
+from rsa_vision.types import Bool, Float, Int
+
+STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
+_UNEVEN = 1.25  # the same, from which something may lie there
+MOST_COVERED = 0.85  # of a ball: from less it cannot be measured
+_TINY = 1e-12
+_NONE = 1e-3  # of a promised squared error
+_QUIETEST = 0.6  # of a promised squared error
+_ROUNDED = 1.0  # variance of noise up to which areas have one value
+_QUARTILE, _OF_CHANCE = 0.75, 2.773  # the upper one, of chi2 with two degrees of freedom: errors by bone have longer tails than it
+_BATCH = 20
+_USUAL = 6.0  # of chi2 with two degrees of freedom: 95 of 100 are less
+_AGREE = 3.0  # less than 1 / OF_SHIFT: by that part of the square in its variance every way back to the fit without the edge would be near
+_LEAST_CHANCE = 0.2  # of the variance by weights alone
+
+
+def settle(
+    film: NDArray[Any],
+    balls: BallFits,
+    places: list[Places],
+    under: float,
+    free: Bool,
+    edged: Bool,
+    beside: Beside,
+    optics: Optics,
+    noise: NoiseModel,
+) -> tuple[BallFits, Float, Float, Bool]:
+    """Fit the centres of balls once more.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    balls : BallFits
+    places : list of Places
+        Around them.
+    under : float
+        Variance of the noise under balls, in units of that beside them.
+    free : ndarray of bool, shape (n,)
+        Not fitted together with a neighbour: those stay as they are.
+    edged : ndarray of bool, shape (n,)
+        Fitted together with an edge: those stay if bending surfaces leave more of it.
+    beside : callable
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    balls : BallFits
+        With new centres, their covariances, and what is left of the windows.
+    ratio : ndarray of shape (n,)
+        Squared errors that free places would make of these centres over those that the covariances promise.
+    by_size : ndarray of shape (n,)
+        Variance of centres whose balls are of a size of their own, px^2, as of :func:`rsa_vision.detect.balls.usual.size_unlike`.
+    covered : ndarray of bool, shape (n,)
+        Something else lies on nearly all of it.
+    """
+    if len(balls.depth) == 0:
+        return balls, np.ones(0), np.zeros(0), np.zeros(0, bool)
+    around = texture(places, len(free), noise)
+    structure = np.where(free[:, None], around.structure, 0.0)
+    alone, level = free & ~edged & (balls.chi2_ring < EDGE), mean_beside(places, len(free))
+    told = alone & np.isfinite(level)
+    clear = balls.rows(alone & (balls.chi2_ring < STRUCTURE))
+    common = Common(
+        optics,
+        noise,
+        under,
+        usual_size(clear),
+        proportion(balls.depth[told], balls.background[told], level[told]),
+        around.differ,
+    )
+    curve = curve_of(film)
+    usual = float(np.median(balls.chi2_uneven[free])) if free.any() else 1.0  # what all balls leave is no speck on one
+    out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
+    for these in places:
+        known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
+        for begin in range(0, len(these.balls), _BATCH):
+            part = these.balls[begin : begin + _BATCH]
+            windows = _without_others(_windows(film, balls, part, these.half, beside, noise), edged[part], common)
+            solution = solve(windows, known, structure[part], common)
+            excess = np.maximum(under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
+            specks = find_specks(solution, solution.radius_px + optics.sigma_px, windows.fits.depth, excess, 2 * these.half + 1, noise)
+            fits = _fits(windows, solution, specks, known, common)
+            better = (balls.chi2_uneven[part] - fits.chi2_uneven) / noise.scatter(fits.n_core)
+            covered[part] = windows.covered
+            crossed, apart = (windows.covered > 0) & (windows.covered <= MOST_COVERED), fits.position_px - balls.position_px[part]
+            both = OF_SHIFT * apart[:, :, None] * apart[:, None] * edged[part, None, None]  # both models could be right
+            both += OF_SHIFT * ((apart**2).sum(axis=1) * crossed)[:, None, None] * np.eye(2)  # what lies on a ball has any profile
+            hidden = _hidden(windows, solution, curve, common)
+            fits.covariance[:, :2, :2] += both + hidden
+            # there is an edge, which surfaces do not know: they are believed if they agree with it, or leave less
+            chance = np.einsum("ni,ni->n", apart, np.linalg.solve(balls.covariance[part, :2, :2], apart[:, :, None])[:, :, 0])
+            stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _AGREE) & (better < CHANCE))
+            moved = free[part] & ~(edged[part] & stays)
+            out = _put(out, part, fits, moved)
+            both[~crossed] = 0.0
+            stay = free[part] & ~moved
+            out.covariance[part[stay], :2, :2] += (both + hidden)[stay]
+            mine = (these.near >= begin) & (these.near < begin + _BATCH)
+            by_background = solution.estimator * solution.shade
+            errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
+        ratios.append(errors)
+    by_size = np.zeros(len(free))
+    by_size[edged] = size_unlike(balls.rows(edged), clear)
+    return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], by_size, covered > MOST_COVERED
+
+
+def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: Beside, noise: NoiseModel) -> Windows:
+    fits = balls.rows(part)
+    patches = cut(film, fits.position_px, half, noise)
+    corner = patches.corner_px.astype(np.float64)
+    cols, rows = np.meshgrid(*[np.arange(float(patches.size))] * 2)
+    near = [beside(int(i), cols + c[0], rows + c[1]) for i, c in zip(part, corner, strict=True)]
+    doubtful = np.stack([there for _, there in near])
+    added = np.stack([image for image, _ in near]) + fits.background[:, None, None]
+    flat = (len(part), -1)
+    return Windows(
+        fits,
+        half,
+        corner,
+        (patches.values - added).reshape(flat),
+        added.reshape(flat),
+        (patches.valid & ~doubtful).reshape(flat),
+        np.zeros(len(part)),
+    )
+
+
+def _without_others(windows: Windows, edged: Bool, common: Common) -> Windows:
+    """Mask the pixels of wires, dust and scratches, under the balls as well."""
+    half, noise, sigma_px = windows.half, common.noise, common.optics.sigma_px
+    some = np.flatnonzero((windows.fits.chi2_ring > _UNEVEN) | edged)
+    fits, before = windows.fits.rows(some), windows.valid[some]
+    rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
+    local, rim, depth = fits.position_px - windows.corner_px[some], fits.radius_px + sigma_px, fits.depth[:, None]
+    table = ball_table(round(common.optics.mu_px * sigma_px, 3))
+    value, *by = (shape.astype(np.float64) for shape in slopes(table, cols - local[:, :1], rows - local[:, 1:], fits.radius_px, sigma_px))
+    surface = np.broadcast_to(polynomial(half, cols - half, rows - half).T, (len(some), 6, len(cols)))
+    images = np.concatenate([np.stack([*(depth * slope for slope in by), value], axis=1), surface], axis=1)
+    target, held = hold(fits, common)
+    precision = np.zeros(images.shape[:2])
+    precision[:, 2] = held
+    at_target = depth * (value + (target - fits.radius_px)[:, None] * by[2])
+    weight = before / noise.variance_at(depth * value + windows.added[some])
+    residual = robust_residual(images, windows.data[some] - at_target, weight, precision)
+    under = np.hypot(cols - local[:, :1], rows - local[:, 1:]) < rim[:, None]
+    found = foreign(residual, weight, before & ~under, float(noise.gain(np.array(1.0))))
+    after = before & ~found & ~in_line(found, local, rim)
+    part = (before & ~after & under).sum(axis=1) / np.maximum((before & under).sum(axis=1), 1)
+    valid, covered = windows.valid.copy(), windows.covered.copy()
+    valid[some], covered[some] = np.where((part > MOST_COVERED)[:, None], before, after), part
+    return replace(windows, valid=valid, covered=covered)
+
+
+def _fits(windows: Windows, found: Solution, specks: Specks, known: Modes, common: Common) -> BallFits:
+    """Put centres, their covariances and what is left into a table."""
+    fits, side, estimator = windows.fits, 2 * windows.half + 1, found.estimator
+    at_ease = common.noise.variance_at(fits.background)[:, None]
+    every = np.ones((len(at_ease), 1))
+    covariance = fits.covariance.copy()
+    of_noise, of_plain = (_of_noise(e, found.weight, side, common) for e in (estimator, found.plain))
+    covariance[:, :2, :2] = (
+        of_noise
+        + _surprise(found.apart, of_noise, of_plain)
+        + _by((estimator * found.shade) @ known.surface, at_ease * variance_of(known, found.structure))
+        # what holding the radius at the usual one does where it is not, and what a wrong proportion does
+        + _by(found.inverse[:, :2, 2:3] * found.held[:, None, None], every * common.size.radius_sd_px**2)
+        + _by(np.matmul(estimator, found.ground[:, :, None]), every * common.proportion.sd**2)
+        + specks.covariance
+        + OF_SHIFT * specks.shift_px[:, :, None] * specks.shift_px[:, None]
+    )
+    rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1)
+    local, residual = found.local_px + specks.shift_px, found.residual - specks.image
+    distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
+    core = distance < (found.radius_px + common.optics.sigma_px)[:, None]
+    under, ring = (uneven_white(residual, found.weight, local, side, where, common.noise) for where in (core, ~core))
+    left = (found.weight * residual**2 * core).sum(axis=1) / np.maximum((core & (found.weight > 0)).sum(axis=1), 1)
+    left = np.minimum(left, fits.chi2_core)  # a fit that is the best in correlated noise leaves more of slow changes
+    position = local + windows.corner_px
+    return replace(fits, position_px=position, covariance=covariance, chi2_core=left, chi2_uneven=under, chi2_ring=ring)
+
+
+def _of_noise(estimator: Float, weight: Float, side: int, common: Common) -> Float:
+    """Covariance of what an estimator makes of noise."""
+    by_noise = (estimator / np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]).reshape(-1, 2, side, side)
+    return np.asarray(common.under * influence_covariance(by_noise, common.noise.correlation))
+
+
+def _hidden(windows: Windows, found: Solution, curve: Curve, common: Common) -> Float:
+    """Covariance by changes of the light that the film hides beside a ball and shows under it, shape (n, 2, 2)."""
+    fits, side = windows.fits, 2 * windows.half + 1
+    values = fits.background[:, None] + fits.depth[:, None] * found.images[:, 3]
+    offset = np.mgrid[0:side, 0:side].reshape(2, 1, -1)[::-1] - found.local_px.T[:, :, None]  # by columns, by rows
+    unseen = offset * unseen_slope(fits.background, windows.half, curve, common.noise)[:, None]
+    shown_more = np.stack([shown(values, fits.background, change, curve, common.noise) for change in (found.back, *unseen)], axis=2)
+    return _by(np.matmul(found.estimator, shown_more), np.ones((len(values), 3)))
+
+
+def _surprise(apart: Float, efficient: Float, plain: Float) -> Float:
+    """Square of what two estimators differ by, as far as noise does not explain it (Hausman, Econometrica 46, 1978); shape (n, 2, 2).
+
+    Were all as described, the variance of the difference is the difference of the variances. If it is not, neither is known to be better.
+    """
+    size, of_plain = (np.maximum(np.trace(c, axis1=1, axis2=2), _TINY) for c in (efficient, plain))
+    chance = np.maximum(1 - size / of_plain, _LEAST_CHANCE)[:, None, None] * plain + _TINY * np.eye(2)
+    square = np.einsum("ni,ni->n", apart, np.linalg.solve(chance, apart[:, :, None])[:, :, 0])
+    part = np.maximum(1 - _USUAL / np.maximum(square, _TINY), 0.0)
+    return np.asarray(part[:, None, None] * apart[:, :, None] * apart[:, None])
+
+
+def _held_over(values: NDArray[Any], near: Int, estimator: Float, known: Modes, structure: Float, noise: NoiseModel) -> Float:
+    """Squared errors that free places make of centres, over what is stated for noise and structure as they are there, shape (k,)."""
+    side = round(np.sqrt(values.shape[1]))
+    mean = values.mean(axis=1)
+    stated = influence_covariance(estimator.reshape(-1, 2, side, side), noise.correlation)
+    stated = stated + _by(estimator @ known.surface, variance_of(known, structure))
+    stated = stated + _TINY * np.eye(2)  # a ball may lie wholly under others
+    error = np.einsum("kip,kp->ki", estimator[near], values - mean[:, None])
+    square = np.einsum("ki,ki->k", error, np.linalg.solve(stated[near], error[:, :, None])[:, :, 0])
+    return np.asarray(square / noise.variance_at(mean) / _OF_CHANCE)
+
+
+def _least(noise: NoiseModel) -> float:
+    """Part of the promised squared errors that can be all there is: less is not believed of areas of one value, nor of white noise."""
+    return _QUIETEST if noise.is_white or noise.typical_sd**2 < _ROUNDED else _NONE
+
+
+def _by(response: Float, variance: Float) -> Float:
+    """Covariance of what responds (n, 2, k) to independent figures of these variances (n, k)."""
+    return np.asarray(np.matmul(response * variance[:, None], response.swapaxes(1, 2)))
+
+
+def _put(balls: BallFits, part: Int, fits: BallFits, moved: Bool) -> BallFits:
+    """Put the new centres in the place of the old ones."""
+    changed = {}
+    for name in ("position_px", "covariance", "chi2_core", "chi2_uneven", "chi2_ring"):
+        changed[name] = getattr(balls, name).copy()
+        changed[name][part[moved]] = getattr(fits, name)[moved]
+    return replace(balls, **changed)

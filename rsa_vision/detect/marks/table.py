@@ -1,0 +1,135 @@
+"""What was found on a film as one table, in film order, with flags and with all that is known of the errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.decide import EDGE, height_of
+from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, MISFIT, misfit
+from rsa_vision.detect.balls.fits import BallFits, radii
+from rsa_vision.detect.balls.optics import CAP
+from rsa_vision.detect.balls.unlike import COMPANY, of_odd_size, too_pale
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.marks.resolve import doubt_of_number
+from rsa_vision.detect.marks.settle import STRUCTURE
+from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.fits import excess_of, significant_misfit
+from rsa_vision.flags import MarkerFlag
+from rsa_vision.types import Bool, Float, MarkerImages
+
+EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
+WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
+_NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
+_LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
+_SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
+_SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
+_UNLIKE = 2.0  # times the misfit that is usual on the film
+_OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
+
+
+def what_is_left(balls: BallFits, usual: float, sigma_px: float, noise: NoiseModel) -> tuple[Float, Bool]:
+    """Return the misfit of each ball, and which are not described well."""
+    under = replace(balls, chi2_core=balls.chi2_core / max(usual, 1.0))  # noise that all balls have under them is no misfit of one
+    left = misfit(under, noise, CHANCE)
+    specks = balls.radius_px <= radii(sigma_px)[0]  # as small as a fit may be: how small they are is not known, nor what they are
+    # what all of a film leave is an error of the model, which spares their middles; what is left of two in one comes on top of that
+    most = max(DOUBTFUL * MISFIT, _UNLIKE * float(np.median(left))) if len(left) >= COMPANY else DOUBTFUL * MISFIT
+    beside = np.sqrt(np.maximum(balls.chi2_ring - 1, 0.0) * noise.variance_at(balls.background)) / np.maximum(np.abs(balls.depth), 1e-9)
+    return left, (left > most) | ((balls.chi2_ring > EDGE) & (beside > _SLIGHT)) | specks
+
+
+def table_of(
+    film: NDArray[Any],
+    bits: int,
+    balls: BallFits,
+    usual: float,
+    ratio: Float,
+    by_size: Float,
+    touching: Bool,
+    poor_ball: Bool,
+    tees: list[NeedleFit],
+    optics: Optics,
+    noise: NoiseModel,
+) -> tuple[MarkerImages, float]:
+    """Put balls and tees into one table, row by row of the film, with flags.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    bits : int
+    balls : BallFits
+    usual : float
+        Variance of the noise under balls, in units of that beside them.
+    ratio : ndarray of shape (n,)
+        Squared errors by their surroundings, as :func:`rsa_vision.detect.marks.settle.settle` tells.
+    by_size : ndarray of shape (n,)
+        Variances of balls of a size of their own, px^2, as of the same: no noise multiplies them.
+    touching, poor_ball : ndarray of bool, shape (n,)
+        Balls with something as dense beside them; balls that the model does not describe.
+    tees : list of NeedleFit
+        And pins.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    images : MarkerImages
+    evidence : float
+        For marks of this polarity.
+    """
+    full = float(2**bits - 1)
+    n, m = len(balls.depth), len(tees)
+    position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
+    # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
+    left = balls.chi2_uneven / usual
+    excess = np.where(left > 1 + CHANCE * noise.scatter(balls.n_core), left, 1.0)
+    # structure around a ball that its background does not hold goes on under it
+    excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0)) * ratio
+    covariance = np.concatenate(
+        [
+            balls.covariance[:, :2, :2] * excess[:, None, None] + by_size[:, None, None] * np.eye(2),
+            np.array([t.covariance_px2 * excess_of(t, noise) for t in tees]).reshape(-1, 2, 2),
+        ]
+    )
+    radius = np.concatenate([balls.radius_px, [t.shape.half_width_px for t in tees]])
+    depth = np.abs(np.concatenate([balls.depth, [t.depth for t in tees]]))
+    background = np.concatenate([balls.background, [t.background for t in tees]])
+    flags = np.zeros(n + m, np.int64)
+    reach = np.concatenate([balls.radius_px + 1, [t.shape.length_px for t in tees]])
+    edge = (position < reach[:, None]).any(1) | (position[:, 0] > film.shape[1] - 1 - reach) | (position[:, 1] > film.shape[0] - 1 - reach)
+    flags[edge] |= MarkerFlag.EDGE
+    valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in tees]])
+    flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
+    flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
+    flags[:n][touching] |= MarkerFlag.OVERLAP
+    arms = np.array([len(t.angles) for t in tees])
+    for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
+        flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
+    poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
+    flags[poor] |= MarkerFlag.POOR_FIT
+    # what the model does not describe may be two marks in one: its centre is only somewhere in it
+    covariance[poor] += (_SOMEWHERE * radius[poor] ** 2)[:, None, None] * np.eye(2)
+    # whatever lies around it, what was found of a ball lies under its image: evenly spread over a disc at worst
+    most = 0.25 * (balls.radius_px + optics.sigma_px) ** 2
+    covariance[:n] *= np.minimum(1.0, most / np.linalg.eigvalsh(covariance[:n])[:, -1])[:, None, None]
+    covariance[:n] += EXACT_PX**2 * np.eye(2) + doubt_of_number(balls)
+    lost = np.linalg.eigvalsh(covariance[:n])[:, -1] > (_LOST * balls.radius_px) ** 2
+    flags[:n][lost] |= MarkerFlag.POOR_FIT
+    flags[n:][np.linalg.eigvalsh(covariance[n:])[:, -1] > (2 * radius[n:]) ** 2] |= MarkerFlag.POOR_FIT
+    pale = too_pale(depth[:n], balls.covariance[:, 3, 3], balls.background, flags[:n] == 0)
+    marks = np.flatnonzero(~pale)  # what is none is no company for another's odd size
+    odd = marks[of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])]
+    flags[np.append(np.flatnonzero(pale), odd)] |= MarkerFlag.UNLIKE
+    angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
+    shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
+    snr = depth / np.sqrt(noise.variance_at(background))
+    table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
+    # of what is small against the blur hardly any of its depth is seen
+    high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
+    trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))

@@ -1,0 +1,1 @@
+"""Pointed pins and tees: fits, one by one and of a whole film."""

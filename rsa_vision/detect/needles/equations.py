@@ -1,0 +1,239 @@
+"""Linearised fits of the pins or tees of one window, for the fit of all: each one's own parameters and the common ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.patches import damped_solution
+from rsa_vision.detect.film.whitening import Filter
+from rsa_vision.detect.models.needles import NeedleFit, arm_images, arms_by_optics
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.crossing import Window, gain_at, lapping
+from rsa_vision.types import Float, Int
+
+OPTICS, SHARED = 6, 8  # common to all: attenuation, blur, taper, curve (2), tail; then logarithms of half width and length; then directions
+SLANT, SKEW = 0.11, 0.08  # root mean squares, of a square and a product of slopes: rays cross a film at slopes of up to a half
+# slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
+OF_SLANTS = {
+    1: np.eye(2),
+    3: np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0, 0, -1]]),
+}
+_OF_PRODUCT = 0.1  # of the depth: error of the product of two shadows where they lie over each other
+_CORE = 0.3  # of the largest depth, from which the noise is that under a needle
+_RIDGE = 1e-4  # relative: keeps what the pixels do not determine where it is
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Linearised fit of the needles of a window, by needles' own parameters and by the common ones.
+
+    ``own`` (p, n), ``common`` (c, n) and ``residual`` (n,) are weighted to a variance of one; ``normal`` (p + c, p + c) holds the products
+    of the former two. ``prior`` (p,) is one over what an own parameter is expected to be, ``known`` (p,) how much of that it is off.
+    """
+
+    members: list[NeedleFit]
+    images: list[Float]
+    weight: Float
+    left: Float
+    model: Float
+    ground: Float
+    background: float
+    own: Float
+    common: Float
+    normal: Float
+    residual: Float
+    prior: Float
+    known: Float
+    parallel: bool
+
+    @cached_property
+    def inverse(self) -> Float:
+        """Inverse of the normal matrix of the own parameters."""
+        normal = self.normal[: len(self.own), : len(self.own)]
+        scale = np.maximum(np.sqrt(normal.diagonal()), 1e-12)
+        both = scale[:, None] * scale
+        return np.asarray(np.linalg.inv(normal / both + np.diag((self.prior / scale) ** 2 + _RIDGE**2)) / both, np.float64)
+
+    @cached_property
+    def own_by_common(self) -> Float:
+        """Change of the own parameters that takes up one of the common ones, shape (p, c)."""
+        return np.asarray(self.inverse @ self.normal[: len(self.own), len(self.own) :], np.float64)
+
+    @cached_property
+    def own_alone(self) -> Float:
+        """Change of the own parameters, shape (p,), were the common ones right."""
+        return np.asarray(self.inverse @ (self.own @ self.residual + self.prior * self.known), np.float64)
+
+    def information(self) -> tuple[Float, Float]:
+        """Normal matrix (c, c) and right-hand side (c,) of the common parameters, the own ones eliminated, their priors counted."""
+        by_own, alone = self.normal[len(self.own) :, : len(self.own)], self.normal[len(self.own) :, len(self.own) :]
+        matrix, target = alone - by_own @ self.own_by_common, self.common @ self.residual - by_own @ self.own_alone
+        return matrix / self.excess, target / self.excess
+
+    def step(self, change: Float) -> Float:
+        """Change of the own parameters, shape (p,), that goes with one of the common ones."""
+        return np.asarray(self.own_alone - self.own_by_common @ change, np.float64)
+
+    def filtered(self, window: Window, through: Filter) -> Equations:
+        """Return the same by generalised least squares."""
+        white = window.filtered(np.concatenate([self.own, self.common, self.residual[None]]), through)
+        own, common, residual = white[: len(self.own)], white[len(self.own) : -1], white[-1]
+        return replace(self, own=own, common=common, residual=residual, normal=white[:-1] @ white[:-1].T)
+
+    def noise_under(self, own: Float, common: Float) -> float:
+        """Mean square of what is left under the needles once these changes are made over that beside them, each over what a fit leaves.
+
+        NaN where one of the two has no pixels: in film that is saturated around a needle.
+        """
+        square = np.square(self.residual - own @ self.own - common @ self.common)
+        leverage = (self.own * (self.inverse @ self.own)).sum(axis=0)
+        image = np.abs(np.sum(self.images, axis=0))
+        core = image > _CORE * image.max()
+        if core.all() or not core.any():
+            return float("nan")
+        under, beside = (square[where].sum() / (1 - leverage[where]).sum() for where in (core, ~core))
+        return float(under / beside)
+
+    @property
+    def tips(self) -> Int:
+        """Places of the coordinates of the tips among the own parameters."""
+        each = own_parameters(len(self.members[0].angles), self.parallel)
+        return np.add.outer(each * np.arange(len(self.members)), [0, 1]).ravel()
+
+    @property
+    def variance_of_sizes(self) -> Float:
+        """Variances of half widths and lengths, shape (members, 2)."""
+        each = own_parameters(len(self.members[0].angles), self.parallel)
+        at = np.add.outer(each * np.arange(len(self.members)), [2, 3])
+        return np.asarray(self.excess * self.inverse.diagonal()[at], np.float64)
+
+    def surprise(self, change: Float, error_px: float) -> Float:
+        """Squared standard deviations by which a change of the own parameters moves each tip (members,), this error added to its own."""
+        at = self.tips.reshape(-1, 2)
+        covariance = self.inverse[at[:, :, None], at[:, None]] + error_px**2 * np.eye(2)
+        return np.asarray(np.einsum("mi,mi->m", change[at], np.linalg.solve(covariance, change[at][:, :, None])[:, :, 0]) / 2)
+
+    @cached_property
+    def cost(self) -> float:
+        """Minus twice the logarithm of likelihood and prior, but for a constant, were the variance unknown: bone is no noise."""
+        return len(self.residual) * float(np.log(np.mean(self.residual**2))) + float(self.known @ self.known)
+
+    @cached_property
+    def excess(self) -> float:
+        """Chi2 over what noise leaves, at least one."""
+        return max(1.0, float(np.mean(self.weight * self.left**2)))
+
+
+def linearise(
+    window: Window,
+    members: list[NeedleFit],
+    slopes: list[Float],
+    optics: Optics,
+    noise: NoiseModel,
+    parallel: bool,
+    typical: Float,
+    spread: Float,
+    before: Equations | None,
+) -> Equations:
+    """Linearise the fit of the needles of a window where they are.
+
+    Parameters
+    ----------
+    window : Window
+    members : list of NeedleFit
+    slopes : list of ndarrays of shape (6, k, n)
+        As of :func:`by_optics`, one for each.
+    optics : Optics
+    noise : NoiseModel
+    parallel : bool
+        The arms of all needles have the same directions against their first.
+    typical : ndarray of shape (2,)
+        Logarithms of half width and length that are usual on the film.
+    spread : ndarray of shape (members, 2)
+        How far each may differ from them (standard deviations); infinite where nothing is known.
+    before : Equations, optional
+        Those of the step before: noise and gain go with their background and depths.
+
+    Returns
+    -------
+    Equations
+    """
+    surface = window.surface
+    weight = 1.0 / noise.variance_at((window.data if before is None else before.model) + window.beside)
+    blocks = [_arms(window, f, optics) for f in members]
+    if optics.proportion and before is not None:
+        gains = [gain_at(f, before.ground, optics) for f in members]
+        blocks = [b * g for b, g in zip(blocks, gains, strict=True)]
+        slopes = [s * g for s, g in zip(slopes, gains, strict=True)]
+    arms = len(members[0].angles)
+    of_slants = OF_SLANTS[arms]
+    expected = np.array([*[SLANT] * (of_slants.shape[1] - 1), SKEW])
+    lapped = lapping([b[0].sum(0) for b in blocks])
+    linear = np.concatenate([*(b[0] for b in blocks), *lapped, surface])
+    root = np.sqrt(weight)
+    if lapped:  # the product of two blurred shadows is not quite what the film shows of both
+        deepest = max(abs(f.depth) for f in members)
+        root = 1 / np.hypot(1 / root, _OF_PRODUCT * deepest * lapped[0][0])
+    seen = linear * root
+    theta = damped_solution(seen @ seen.T, seen @ (root * window.data), 1e-6)
+    model = theta @ linear
+    left = window.data - model
+    now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
+    moves, common, priors, known = [], np.zeros((SHARED + (arms - 1) * parallel, len(weight))), [], []
+    for f, block, slope, differs in zip(now, blocks, slopes, spread, strict=True):
+        size = np.array([f.shape.half_width_px, f.shape.length_px])
+        by_tip_and_size = f.depths @ block[1:5]
+        turns = f.depths[:, None] * block[5]
+        slants = np.zeros((2, arms)) if f.slants is None else f.slants
+        by_ends = (f.depths[:, None] * block[6:]).reshape(2 * arms, -1)
+        moves += [by_tip_and_size, turns.sum(0, keepdims=True) if parallel else turns, of_slants.T @ by_ends]
+        common[:OPTICS] += f.depths @ slope
+        common[OPTICS:SHARED] += size[:, None] * by_tip_and_size[2:]
+        if parallel:
+            common[SHARED:] += turns[1:]
+        turning = np.zeros(1 if parallel else arms)
+        priors += [np.zeros(2), 1 / (differs * size), turning, 1 / expected]
+        known += [
+            np.zeros(2),
+            (typical - np.log(size)) / differs,
+            turning,
+            -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected,
+        ]
+    rows = np.concatenate([*moves, linear, common]) * root
+    p, rest = len(rows) - len(common), np.zeros(len(linear))
+    return Equations(
+        members=now,
+        images=[f.depths @ b[0] for f, b in zip(now, blocks, strict=True)],
+        weight=weight,
+        left=left,
+        model=model,
+        ground=theta[1 - len(surface) :] @ surface[1:],
+        background=float(theta[-len(surface)]),
+        own=rows[:p],
+        common=rows[p:],
+        normal=rows @ rows.T,
+        residual=left * root,
+        prior=np.concatenate([*priors, rest]),
+        known=np.concatenate([*known, rest]),
+        parallel=parallel,
+    )
+
+
+def own_parameters(arms: int, parallel: bool) -> int:
+    """Count tip (2), half width, length, one or all directions and what the ends have; the depths are linear."""
+    return 4 + (1 if parallel else arms) + int(OF_SLANTS[arms].shape[1])
+
+
+def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
+    slants = np.zeros((2, len(fit.angles))) if fit.slants is None else fit.slants
+    return arm_images(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit.angles, fit.shape, optics, slants)
+
+
+def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
+    """Derivatives of each member's arms by what is common, shape (6, k, n), as of :func:`arms_by_optics`."""
+    offsets = [(window.cols - f.position_px[0], window.rows - f.position_px[1]) for f in members]
+    return [arms_by_optics(*at, f.angles, f.shape, optics) for at, f in zip(offsets, members, strict=True)]

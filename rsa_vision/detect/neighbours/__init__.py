@@ -1,0 +1,1 @@
+"""Balls beside, under and over something else: other balls, edges, lines, dust."""

@@ -1,0 +1,75 @@
+"""What lies beside a ball: which touch each other, the images of all others, to be taken away, and what is around them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from rsa_vision.detect.balls.fits import BallFits, ball_image
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.types import Bool, Float, Int
+
+Background = Callable[[Float, Float], Float]
+"""Images at pixels (cols, rows), in film values."""
+
+Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
+"""Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
+
+TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the fit of the other
+MOST_IN_GROUP = 5
+
+
+def groups_of(fits: BallFits, optics: Optics) -> list[list[int]]:
+    """Sets of balls whose images touch."""
+    n = len(fits.depth)
+    if n == 0:
+        return []
+    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
+    touch = gap < fits.radius_px[:, None] + fits.radius_px[None] + TOUCH * optics.sigma_px
+    _, label = connected_components(csr_array(touch), directed=False)
+    return [np.nonzero(label == k)[0].tolist() for k in range(label.max() + 1)]
+
+
+def lapping_balls(fits: BallFits) -> Bool:
+    """Say whose shadows lie over each other, shape (n, n); each over its own."""
+    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
+    return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
+
+
+def all_but(known: BallFits, members: Int, optics: Optics, tees: Background | None) -> Background:
+    """Return the images of the tees and of all balls but ``members``, as a function of pixels (cols, rows)."""
+    return lambda cols, rows: images_beside(known, members, optics, tees, cols, rows)[0]
+
+
+def images_beside(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
+    """Return the images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
+    total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
+    doubtful: Bool = np.zeros(cols.shape, np.bool_)
+    reach = known.radius_px + 4 * optics.sigma_px
+    low, high = (np.array([cols.flat[k], rows.flat[k]]) for k in (0, -1))
+    near = np.array(((known.position_px > low - reach[:, None]) & (known.position_px < high + reach[:, None])).all(1))
+    near[members] = False
+    for j in np.nonzero(near)[0]:
+        dx, dy = cols - known.position_px[j, 0], rows - known.position_px[j, 1]
+        image = ball_image(dx.reshape(1, -1), dy.reshape(1, -1), known.radius_px[[j]], optics.sigma_px, optics.mu_px)
+        total = total + known.depth[j] * image.reshape(cols.shape)
+        doubtful = doubtful | (np.hypot(dx, dy) < known.radius_px[j] + optics.sigma_px)
+    return total, doubtful
+
+
+def deep_at(film: NDArray[Any], peaks: Float, radius: float, tees: Background | None) -> Float:
+    """How far the film less its tees differs at these places from the median of a ring well outside a ball there."""
+    angle = 2 * np.pi * np.arange(16) / 16
+    reach = 2 * radius + 3
+    cols = np.rint(peaks[:, :1] + reach * np.cos(angle)).astype(np.intp).clip(0, film.shape[1] - 1)
+    rows = np.rint(peaks[:, 1:] + reach * np.sin(angle)).astype(np.intp).clip(0, film.shape[0] - 1)
+    col, row = np.rint(peaks).astype(np.intp).T
+    middle = film[row.clip(0, film.shape[0] - 1), col.clip(0, film.shape[1] - 1)].astype(np.float64)
+    if tees is not None:
+        middle -= tees(*peaks.T)
+    return np.asarray(np.abs(middle - np.median(film[rows, cols], axis=1)))

@@ -1,0 +1,110 @@
+"""Two balls melted into one blob: told from one ball by what that cannot explain, started from the blob's length and direction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.find import SURE, plausible
+from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.neighbours.groups import fit_group
+from rsa_vision.types import Float
+
+LEAST_APART = 0.7  # of the radius: nearer centres cannot be told apart with confidence, and pass for one place
+LEAST_GAIN = 30.0  # twice the log-likelihood that four parameters more must gain
+STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
+_SIZES = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
+OF_A_BLOB = 0.8  # of the radius of a ball fitted to two
+CLEAR, NEARLY = 2.0 * SURE, 0.6  # significance of blobs that tell, and the part of them that one ball explains
+_VAIN = 40  # attempts of a film that may fail
+
+
+def split_blobs(
+    film: NDArray[Any],
+    blobs: BallFits,
+    balls: BallFits,
+    optics: Optics,
+    noise: NoiseModel,
+    beside: Callable[[], Any],
+) -> list[BallFits]:
+    """Explain blobs that are no single balls by two.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    blobs : BallFits
+        Single fits that were turned down.
+    balls : BallFits
+        Those that were not: what two balls have to be like. Where there are none, the surest blobs tell.
+    optics : Optics
+    noise : NoiseModel
+    beside : callable
+        ``beside()``: images of the known balls and tees, for the fits to subtract.
+
+    Returns
+    -------
+    list of BallFits
+        Pairs that explain their blob.
+    """
+    like = balls if len(balls.depth) else blobs.rows((blobs.significance > CLEAR) & (blobs.explained > NEARLY))
+    if len(like.depth) == 0:
+        return []
+    radius, depth = (float(np.median(of)) for of in (like.radius_px, np.abs(like.depth)))
+    radius *= 1.0 if len(balls.depth) else OF_A_BLOB
+    size = blobs.radius_px / radius
+    worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (np.abs(blobs.depth) > 0.4 * depth) & (blobs.explained > 0.6)
+    least = LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)
+    out: list[BallFits] = []
+    tried = 0
+    for i in np.nonzero(worth)[0]:
+        if tried - len(out) == _VAIN:
+            break
+        place = blobs.position_px[i]
+        if any(np.hypot(*(pair.position_px - place).T).min() < radius for pair in out):
+            continue
+        tried += 1
+        others = beside()
+        whole = fit_group(film, place[None], blobs.radius_px[[i]], optics.sigma_px, optics.mu_px, noise, others)
+        if whole.chi2_core[0] <= least:
+            continue  # even two that left nothing would not be better by enough
+        axis = long_axis(film, whole, np.sign(blobs.depth[i]))
+        for stretch in STRETCH:
+            starts = whole.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
+            pair = fit_group(film, starts, np.full(2, radius), optics.sigma_px, optics.mu_px, noise, others)
+            if _two(pair, whole, radius, depth, least, noise):
+                out.append(pair)
+                break
+    return out
+
+
+def _two(pair: BallFits, whole: BallFits, radius: float, depth: float, least: float, noise: NoiseModel) -> bool:
+    apart = float(np.hypot(*(pair.position_px[1] - pair.position_px[0])))
+    alike = (np.abs(np.log(pair.radius_px / radius)) < 0.3) & (np.abs(pair.depth) > 0.4 * depth) & (np.abs(pair.depth) < 2.5 * depth)
+    one_sign = pair.depth[0] * pair.depth[1] > 0
+    held = bool((np.hypot(*(pair.position_px - whole.position_px[0]).T) < 2.5 * radius).all())
+    # the window of two is larger than that of one: compare what is left under the balls only
+    better = whole.chi2_core[0] - float(pair.chi2_core.mean()) > least
+    return bool(apart > LEAST_APART * radius and alike.all() and one_sign and held and better and plausible(pair, noise).all())
+
+
+def long_axis(film: NDArray[Any], blob: BallFits, sign: float) -> Float:
+    """Vector along a blob from the centre of one ball to that of the other, by the second moments of what lies over the background."""
+    centre = blob.position_px[0]
+    reach = int(np.ceil(2.2 * blob.radius_px[0] + 2))
+    col, row = np.rint(centre).astype(np.intp)
+    top, left = max(row - reach, 0), max(col - reach, 0)
+    window = film[top : row + reach + 1, left : col + reach + 1].astype(np.float64)
+    rows, cols = np.mgrid[0 : window.shape[0], 0 : window.shape[1]]
+    dx, dy = cols + left - centre[0], rows + top - centre[1]
+    over = np.maximum(sign * (window - blob.background[0]), 0.0) * (np.hypot(dx, dy) < reach)
+    total = max(float(over.sum()), 1e-9)
+    moments = np.array([[(over * dx * dx).sum(), (over * dx * dy).sum()], [(over * dx * dy).sum(), (over * dy * dy).sum()]]) / total
+    small, large = np.linalg.eigvalsh(moments)
+    direction: Float = np.linalg.eigh(moments)[1][:, 1]
+    between: Float = 2.0 * np.sqrt(max(large - small, 0.04)) * direction
+    return between

@@ -1,0 +1,90 @@
+"""Balls on and beside the edges of bones and implants, fitted with the edge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.decide import hopeless, of_size
+from rsa_vision.detect.balls.find import plausible
+from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits, join
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, all_but, groups_of
+from rsa_vision.detect.neighbours.groups import edge_gain, fit_group
+from rsa_vision.types import Bool
+
+NEAR_EDGES = 2.5  # times the misfit that balls may leave: what an edge beside them adds to it
+OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added to the stated variance
+EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
+_FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
+_MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: each makes what else is fitted less sure
+
+
+def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> tuple[BallFits, Bool]:
+    """Fit again, with an edge in the background, the balls that lie on or beside one (the likelihood tells); say which they are.
+
+    An edge that a quadratic surface cannot follow pulls the centre. What the edge model moves it by says how much is at stake: a quarter of
+    its square is added to the stated variance, since edges have other profiles than the model's.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    fits : BallFits
+        Of a film's balls; what is of no size that those have is dropped.
+    optics : Optics
+    noise : NoiseModel
+    tees : callable, optional
+        Images to be taken away first.
+
+    Returns
+    -------
+    fits : BallFits
+    edged : ndarray of bool, shape (n,)
+        Fitted with an edge.
+    """
+    fits = fits.rows(of_size(fits, optics.sigma_px, noise))
+    parts, edged_too = [fits.rows(slice(0))], []
+    worth = ~hopeless(fits, optics.sigma_px, noise)
+    for g in groups_of(fits, optics):
+        index = np.array(g)
+        edged_too.append(np.zeros(len(g), bool))
+        beside = all_but(fits, index, optics, tees)
+        plain = fits.rows(index)
+        # a size at the limit is not fitted: nothing that comes to rest there is a ball
+        if len(g) > MOST_IN_GROUP or not worth[index].any() or (plain.radius_px >= RADIUS_PX[1]).any():
+            parts.append(plain)
+            continue
+        foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside) / noise.correlation.sum()
+        if foreseen < _FORESEEN * EDGE_GAIN:
+            parts.append(plain)
+            continue
+        at = (film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside)
+        flat, straight = fit_group(*at), fit_group(*at, edge=True)
+        models = [(0.0 if straight.converged.all() else -np.inf, straight)]
+        for taken, bent in ((True, False), (False, True), (True, True)):
+            if taken and bent and len(models) > 1 and max(models, key=lambda model: model[0]) is models[0]:
+                break  # what neither gains alone both do not
+            other = fit_group(*at, edge=True, taken=taken, bent=bent)
+            if other.converged.all():
+                models.append((_gain(other, straight, noise) - _MORE_GAIN * (taken + bent), other))
+        best, edged = max(models, key=lambda model: model[0])
+        lost = plausible(plain, noise) & ~plausible(edged, noise)
+        if _gain(edged, flat, noise) < EDGE_GAIN or not edged.converged.all() or lost.any():
+            parts.append(plain)
+            continue
+        covariance = edged.covariance.copy()
+        for rival in [plain, *(model for worth_it, model in models if worth_it > best - _MORE_GAIN)]:
+            shift = edged.position_px - rival.position_px
+            covariance[:, :2, :2] += OF_SHIFT * shift[:, :, None] * shift[:, None, :]
+        parts.append(replace(edged, covariance=covariance))
+        edged_too[-1][:] = True
+    return join(parts), np.concatenate([np.zeros(0, bool), *edged_too])
+
+
+def _gain(fits: BallFits, simpler: BallFits, noise: NoiseModel) -> float:
+    """Return twice the log-likelihood that one model of a group gains over another."""
+    return float(2 * (fits.log_likelihood[0] - simpler.log_likelihood[0]) / noise.correlation.sum())

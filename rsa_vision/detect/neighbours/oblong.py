@@ -1,0 +1,100 @@
+"""Images longer one way than the other: two balls nearly in one beam, that one ball fits in noise but for their outline.
+
+What is the same on opposite sides of the centre does not move it, and is not asked for elsewhere; two in one leave just that.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.equations import invert, polynomial
+from rsa_vision.detect.balls.fits import BallFits, half_size, slopes
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.patches import cut
+from rsa_vision.detect.film.whitening import whiten_rows
+from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.neighbours.beside import Beside
+from rsa_vision.types import Bool, Float
+
+_LEAST = 0.08  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make twice that
+_SURE = 14.0  # chi2 with two degrees of freedom: one image in a thousand, if noise makes that much of an outline at all
+_AMONG_OTHERS = 3.2  # the same where most images are oblong: one in five
+_MEDIAN = 1.386  # of that
+_LEAST_KNOWN = 6  # images that tell how a focal spot draws all
+_MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
+_STEP_PX = 0.1  # for derivatives
+
+
+def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> Bool:
+    """Say which images are longer one way than the other, beyond what images of the film are and beyond noise and structure around.
+
+    To first order: with second moments that differ by ``m`` between the long axis and the short one, as two images ``d`` apart have
+    ``m = d^2 / 4``, an image ``f(s)`` changes by ``m / 4 cos(2 (phi - phi0)) (f'' - f' / s)``.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    balls : BallFits
+    beside : callable
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    if len(balls.depth) == 0:
+        return np.zeros(0, bool)
+    apart, covariance = _outlines(film, balls, beside, optics, noise)
+    if len(apart) >= _LEAST_KNOWN:
+        apart = apart - np.median(apart, axis=0)  # a focal spot draws all images alike
+    covariance = covariance * np.maximum(balls.chi2_ring, 1.0)[:, None, None]
+    chance = np.einsum("ni,ni->n", apart, np.linalg.solve(covariance, apart[:, :, None])[:, :, 0])
+    length = np.hypot(*apart.T) / balls.radius_px**2
+    usual = max(1.0, float(np.median(chance)) / _MEDIAN)
+    told = (chance > _SURE) & (length > _LEAST)
+    much = told & (length > _MUCH)
+    most = np.count_nonzero(much) > len(much) / 2  # where most images are two balls there is no usual one
+    told &= chance > _SURE * usual
+    if most or len(told) < _LEAST_KNOWN:
+        told |= much
+    if most:
+        told |= (chance > _AMONG_OTHERS) & (length > _MUCH)
+    return np.asarray(told)
+
+
+def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
+    """Differences of second moments, ``m cos(2 phi0)`` and ``m sin(2 phi0)`` in px^2 (n, 2), and their covariances."""
+    halves = np.array([half_size(r, optics.sigma_px) for r in balls.radius_px])
+    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
+    out, covariance = np.zeros((len(halves), 2)), np.zeros((len(halves), 2, 2))
+    for half in np.unique(halves):
+        index = np.flatnonzero(halves == half)
+        fits, side = balls.rows(index), 2 * int(half) + 1
+        patches = cut(film, fits.position_px, int(half), noise)
+        rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1).astype(np.float64)
+        near = [beside(int(i), cols + c, rows + r) for i, (c, r) in zip(index, patches.corner_px, strict=True)]
+        data = patches.values.reshape(len(index), -1) - np.stack([image for image, _ in near])
+        valid = patches.valid.reshape(len(index), -1) & ~np.stack([doubtful for _, doubtful in near])
+        dx, dy = (axis - at[:, None] for axis, at in zip((cols, rows), (fits.position_px - patches.corner_px).T, strict=True))
+        value, *by = slopes(table, dx, dy, fits.radius_px, optics.sigma_px)
+        square = np.maximum(dx**2 + dy**2, 1e-9)
+        reach = np.sqrt(square)
+        longer = 1 + _STEP_PX / reach
+        farther = slopes(table, dx * longer, dy * longer, fits.radius_px, optics.sigma_px)[1:3]
+        falls, then = ((of[0] * dx + of[1] * dy) / reach for of in (by, farther))
+        bend = (then - falls) / _STEP_PX - falls / reach
+        outline = 0.25 * bend[:, None] * np.stack([(dx**2 - dy**2) / square, 2 * dx * dy / square], axis=1)
+        surface = np.broadcast_to(polynomial(int(half), cols - half, rows - half).T, (len(index), 6, side**2))
+        moves = fits.depth[:, None, None] * np.concatenate([np.stack(by, axis=1), outline], axis=1)
+        images = np.concatenate([moves, value[:, None], surface], axis=1)
+        root = np.sqrt(valid / noise.variance_at(fits.background[:, None] + fits.depth[:, None] * value))
+        white = whiten_rows(images * root[:, None], side, noise)
+        left = whiten_rows((data - fits.background[:, None] - fits.depth[:, None] * value) * root, side, noise)
+        inverse = invert(np.matmul(white, white.swapaxes(1, 2)))
+        change = np.matmul(inverse, np.matmul(white, left[:, :, None]))[:, :, 0]
+        out[index], covariance[index] = change[:, 3:5], inverse[:, 3:5, 3:5]
+    return out, covariance

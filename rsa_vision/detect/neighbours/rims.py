@@ -1,0 +1,65 @@
+"""Whether what looks like a ball goes on beyond its rim, as the ends, kinks and crossings of wires, bars and letters do."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.detect.neighbours.beside import Beside
+from rsa_vision.types import Bool, Float, Int
+
+BEYOND: Final = 2.0  # blur widths outside the rim, where hardly anything of a ball is left
+AS_HIGH: Final = 0.8  # of the height: a ball over the strongest thing that it still outdoes has half
+HALF: Final = 0.5
+MOST_OF_A_RIM: Final = 0.4  # what takes up more on one side is the edge of something that a ball may lie on
+_DIRECTIONS = 2 * np.pi * np.arange(24) / 24
+_WITHIN: Final = 0.5  # of the radius: the middle
+
+
+def goes_on(film: NDArray[Any], balls: BallFits, number: Int, beside: Beside, sigma_px: float) -> Bool:
+    """Say which images are as high beyond their rims, in a narrow part of it or on two sides that face each other, as in their middle.
+
+    A ball adds its image to what it lies on, so it is higher than that all round, but where an edge passes by. The end of a bar is not.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    balls : BallFits
+    number : ndarray of int, shape (n,)
+        What ``beside`` calls each.
+    beside : callable
+        The images of other marks are subtracted.
+    sigma_px : float
+        Blur of the film.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    out = np.zeros(len(balls.depth), bool)
+    for i, (place, radius, depth) in enumerate(zip(balls.position_px, balls.radius_px, balls.depth, strict=True)):
+        reach = np.append(np.repeat([0.0, _WITHIN], [1, len(_DIRECTIONS)]) * radius, np.full(len(_DIRECTIONS), radius + BEYOND * sigma_px))
+        angle = np.concatenate([[0.0], _DIRECTIONS, _DIRECTIONS])
+        cols, rows = place[0] + reach * np.cos(angle), place[1] + reach * np.sin(angle)
+        values = np.sign(depth) * (_sample(film, cols, rows) - beside(int(number[i]), cols, rows)[0])
+        middle, around = np.median(values[: -len(_DIRECTIONS)]), values[-len(_DIRECTIONS) :]
+        around = (np.roll(around, 1) + around + np.roll(around, -1)) / 3
+        low = np.percentile(around, 25)
+        height = (around - low) / max(middle - low, 1e-9)
+        narrow = (height > HALF).mean() < MOST_OF_A_RIM
+        opposite = np.minimum(height, np.roll(height, len(_DIRECTIONS) // 2))
+        out[i] = (narrow and height.max() > AS_HIGH) or opposite.max() > AS_HIGH
+    return out
+
+
+def _sample(film: NDArray[Any], cols: Float, rows: Float) -> Float:
+    """Values between pixels, of a film that goes on beyond its border as it ends there."""
+    corner = np.floor([cols.min(), rows.min()]).astype(int).clip(0, np.array(film.shape[::-1]) - 1)
+    end = np.ceil([cols.max(), rows.max()]).astype(int).clip(corner, np.array(film.shape[::-1]) - 1) + 1
+    patch = film[corner[1] : end[1], corner[0] : end[0]].astype(np.float32)
+    at = (cols - corner[0]).astype(np.float32), (rows - corner[1]).astype(np.float32)
+    return np.asarray(cv2.remap(patch, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float64).ravel()

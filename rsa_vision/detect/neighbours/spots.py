@@ -1,0 +1,313 @@
+"""Balls drawn by a focal spot that is no Gaussian: what the odd images of a film have in common is its spot.
+
+Far above the film a ball's image is spread by the focal spot, times the magnification less one: by two ridges 5 pixels apart, where that
+of a mark near the film is sharp. No blurred ball looks like that. A spot, as far as balls let it be seen, is two peaks of different
+weights, each a pair across: four points, which stand for squares and discs as well. All images of the spot on marks of one height are the
+same. So what single odd things look like excuses none of them: only what one spot explains of many is a ball.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, over_clutter
+from rsa_vision.detect.balls.equations import invert, polynomial
+from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, SURE, misfit, plausible
+from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits, half_size, slopes, uneven, uneven_white
+from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
+from rsa_vision.detect.film.patches import cut
+from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.neighbours.blobs import LEAST_GAIN
+from rsa_vision.detect.neighbours.double_images import gain_over_two
+from rsa_vision.types import Bool, Float
+
+COMPANY = 6  # odd ones that one spot has to explain: twice what it has parameters, less one
+_MOST = 12  # that tell the spot roughly
+_EXPLAINED = 0.85
+_FAINT = 0.25  # of the depth of those, or of the sixth deepest: bone
+_LIKE = 1.25  # ratio of radii
+_REACH = 0.8  # of the radius: what is spread farther is no ball with a spot, but a rod or a pair
+_ACROSS = 0.25  # of the distance along: two points without extent across are pairs of balls, no spot
+_STARTS = np.deg2rad([0.0, 45.0, 90.0, 135.0])
+_STEPS, _LAST_STEPS = 6, 12
+_H = 0.02  # pixels, for derivatives by the spot
+_MOST_STEP_PX = 0.6
+_SHRINK = 0.9  # of the radius, which has taken some of the spread
+_BETTER = 0.5  # of what they left: less than that they leave with the spot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spot:
+    """Focal spot, as spread over marks of one height.
+
+    Attributes
+    ----------
+    points : ndarray of shape (4, 2)
+        (col, row) from the centroid, px.
+    weights : ndarray of shape (4,)
+    """
+
+    points: Float
+    weights: Float
+
+
+def spot_of(along: Float) -> Spot:
+    """Return the spot of two peaks ``2 (col, row)`` apart, each of two points ``2 b`` apart across, of weights ``(1 ± u) / 2``.
+
+    Parameters
+    ----------
+    along : ndarray of shape (4,)
+        col, row, b, u.
+    """
+    peak, b, uneven_ = along[:2], along[2], along[3]
+    across = np.array([-peak[1], peak[0]]) / max(float(np.hypot(*peak)), 1e-9) * b
+    sides = np.array([1.0, 1.0, -1.0, -1.0])
+    points = (sides - uneven_)[:, None] * peak + np.array([1.0, -1.0, 1.0, -1.0])[:, None] * across
+    return Spot(points, (1 + sides * uneven_) / 4)
+
+
+def spot_image(spot: Spot, dx: Float, dy: Float, radius: Float, optics: Optics) -> Float:
+    """Return images of balls of depth one, shape (n, p), at these pixels from their centres."""
+    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
+    parts = [w * slopes(table, dx - p[0], dy - p[1], radius, optics.sigma_px)[0] for p, w in zip(spot.points, spot.weights, strict=True)]
+    return np.asarray(sum(parts))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    along: Float  # (4,)
+    local: Float  # (n, 2)
+    radius: Float  # (n,)
+    linear: Float  # (n, 7): depth and background
+
+
+def find_spot(
+    film: NDArray[Any], odd: BallFits, sure: BallFits, optics: Optics, noise: NoiseModel, others: Any
+) -> tuple[BallFits, Spot | None, Bool]:
+    """Find the spot that explains odd images, and fit the balls that it explains.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    odd : BallFits
+        Single fits that leave more than a ball should.
+    sure : BallFits
+        Clear balls.
+    optics : Optics
+    noise : NoiseModel
+    others : callable, optional
+        ``others(i, cols, rows)``: images of neighbours, and where they are not to be trusted.
+
+    Returns
+    -------
+    fits : BallFits
+        None of them where fewer than :data:`COMPANY` are explained.
+    spot : Spot or None
+    doubtful : ndarray of bool, shape (n,)
+        Two balls of the film's own explain these nearly as well: their covariances hold both.
+    """
+    none, nobody = odd.rows(slice(0)), np.zeros(0, bool)
+    worth = (
+        (odd.explained > _EXPLAINED)
+        & (over_clutter(odd) > SURE)
+        & (odd.valid_fraction > 0.95)
+        & (odd.window_fraction > 0.5)
+        & (odd.radius_px < RADIUS_PX[1])
+    )
+    odd = odd.rows(worth)
+    # tantalum, not bone, and those with most company of their size
+    if len(odd.depth) < COMPANY:
+        return none, None, nobody
+    depth = np.abs(odd.depth)
+    usual = np.median(np.abs(sure.depth)) if len(sure.depth) >= LEAST_KNOWN else np.sort(depth)[-COMPANY]
+    odd = odd.rows(depth > _FAINT * usual)
+    like = np.abs(np.log(odd.radius_px[:, None] / odd.radius_px)) < np.log(_LIKE)
+    if like.sum(axis=1).max(initial=0) < COMPANY:
+        return none, None, nobody
+    odd = odd.rows(like[like.sum(axis=1).argmax()])
+    odd = odd.rows(np.argsort(-over_clutter(odd)))
+    radius = float(np.median(odd.radius_px))
+    half = half_size(radius, optics.sigma_px)
+    few = _window(film, odd.rows(slice(_MOST)), half, others, noise)
+    trials = []
+    for angle in _STARTS:
+        along = np.array([0.4 * radius * np.cos(angle), 0.4 * radius * np.sin(angle), 0.2 * radius, 0.0])
+        trials.append(_fitted(few, _start(odd.rows(slice(_MOST)), few, along), _STEPS, optics, noise, radius))
+    best, _ = min(trials, key=lambda trial: float(np.log(trial[1]).sum()))
+    window = _window(film, odd, half, others, noise)
+    state, _ = _fitted(window, _start(odd, window, best.along), _LAST_STEPS, optics, noise, radius)
+    if abs(state.along[2]) < _ACROSS * np.hypot(*state.along[:2]):
+        return none, None, nobody
+    fits = _table(window, state, odd, optics, noise)
+    rest, before = misfit(fits, noise), misfit(odd, noise)
+    alike = np.abs(np.log(fits.radius_px / np.median(fits.radius_px))) < np.log(_LIKE)  # others are at another height
+    kept = alike & plausible(fits, noise) & (rest < np.maximum(DOUBTFUL * MISFIT, _BETTER * before))
+    if np.count_nonzero(kept & (rest < _BETTER * before)) < COMPANY:
+        return none, None, nobody
+    spot, better = spot_of(state.along), (rest < _BETTER * before)[kept]
+    fits, odd = fits.rows(kept), odd.rows(kept)
+
+    def image(i: int, cols: Float, rows: Float) -> Float:
+        dx, dy = (axis[None] - middle for axis, middle in zip((cols, rows), fits.position_px[i], strict=True))
+        return np.asarray(spot_image(spot, dx, dy, fits.radius_px[[i]], optics)[0])
+
+    gain, apart = gain_over_two(film, fits, image, odd, sure, optics, noise, others)
+    if np.count_nonzero(better & (gain > LEAST_GAIN)) < COMPANY:
+        return none, None, nobody
+    doubtful = gain < LEAST_GAIN
+    covariance = fits.covariance.copy()
+    covariance[doubtful, :2, :2] += apart[doubtful, :, None] * apart[doubtful, None]
+    may_be = gain > -LEAST_GAIN
+    return replace(fits, covariance=covariance).rows(may_be), spot, doubtful[may_be]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    half: int
+    corner: Float  # (n, 2)
+    data: Float  # (n, p), less neighbours
+    added: Float  # (n, p), those
+    valid: Float  # (n, p)
+    cols: Float  # (p,)
+    rows: Float
+    surface: Float  # (6, p)
+
+
+def _start(odd: BallFits, window: _Window, along: Float) -> _State:
+    return _State(along, odd.position_px - window.corner, _SHRINK * odd.radius_px, np.zeros((len(odd.depth), 7)))
+
+
+def _window(film: NDArray[Any], balls: BallFits, half: int, others: Any, noise: NoiseModel) -> _Window:
+    patches = cut(film, balls.position_px, half, noise)
+    corner, n = patches.corner_px.astype(np.float64), len(balls.depth)
+    rows, cols = np.mgrid[0 : patches.size, 0 : patches.size].astype(np.float64)
+    added, valid = np.zeros((n, *cols.shape)), patches.valid
+    if others is not None:
+        near = [others(i, cols + c[0], rows + c[1]) for i, c in enumerate(corner)]
+        added, valid = np.stack([image for image, _ in near]), valid & ~np.stack([doubtful for _, doubtful in near])
+    surface = polynomial(half, cols.ravel() - half, rows.ravel() - half).T
+    flat = (n, -1)
+    data = (patches.values - added).reshape(flat)
+    return _Window(half, corner, data, added.reshape(flat), valid.reshape(flat).astype(float), cols.ravel(), rows.ravel(), surface)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """What windows say of their balls: images, residuals and derivatives, all but the images over the standard deviations of the pixels."""
+
+    value: Float  # (n, p)
+    own: Float  # (n, 10, p)
+    shared: Float  # (n, 4, p)
+    root: Float  # (n, p), 1 / standard deviations
+    residual: Float  # (n, p)
+    linear: Float  # (n, 7)
+
+
+def _equations(w: _Window, s: _State, optics: Optics, noise: NoiseModel) -> _Equations:
+    spot, n = spot_of(s.along), len(s.radius)
+    sides = [(spot_of(s.along + h), spot_of(s.along - h)) for h in _H * np.eye(len(s.along))]
+    by_points, by_weights = (np.stack([(getattr(a, f) - getattr(b, f)) / (2 * _H) for a, b in sides]) for f in ("points", "weights"))
+    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
+    dx, dy = w.cols - s.local[:, :1], w.rows - s.local[:, 1:]
+    by = np.zeros((4, *dx.shape))  # of the ball: value, slopes by col, row and radius
+    shared = np.zeros((n, len(s.along), dx.shape[1]))
+    for k, (point, weight) in enumerate(zip(spot.points, spot.weights, strict=True)):
+        part = slopes(table, dx - point[0], dy - point[1], s.radius, optics.sigma_px)
+        by += weight * np.stack(part)
+        shift = by_points[:, k, :, None, None] * weight
+        shared += (by_weights[:, k, None, None] * part[0] - shift[:, 0] * part[1] - shift[:, 1] * part[2]).transpose(1, 0, 2)
+    linear = np.concatenate([by[0][:, None], np.broadcast_to(w.surface, (n, *w.surface.shape))], axis=1)
+    model = np.matmul(s.linear[:, None], linear)[:, 0] if s.linear.any() else w.data
+    root = np.sqrt(w.valid / noise.variance_at(model + w.added))
+    weighted = linear * root[:, None]
+    inverse = invert(np.matmul(weighted, weighted.transpose(0, 2, 1)))
+    theta = np.matmul(inverse, np.matmul(weighted, (root * w.data)[:, :, None]))[:, :, 0]
+    residual = root * w.data - np.matmul(theta[:, None], weighted)[:, 0]
+    of_ball = (theta[:, :1] * root)[:, None]
+    place = np.stack([-by[1], -by[2], by[3]], axis=1) * of_ball
+    return _Equations(by[0], np.concatenate([place, weighted], axis=1), shared * of_ball, root, residual, theta)
+
+
+def _fitted(w: _Window, s: _State, steps: int, optics: Optics, noise: NoiseModel, radius: float) -> tuple[_State, Float]:
+    left = np.ones(len(s.radius))
+    for _ in range(steps):
+        e = _equations(w, s, optics, noise)
+        own, shared, residual = e.own, e.shared, e.residual
+        left = np.square(residual).sum(axis=1) / np.maximum(w.valid.sum(axis=1), 1)
+        say = 1 / np.maximum(left, 1.0)
+        inverse = invert(np.matmul(own, own.transpose(0, 2, 1)))
+        of_own = np.matmul(inverse, np.matmul(own, shared.transpose(0, 2, 1)))
+        rest = shared - np.matmul(of_own.transpose(0, 2, 1), own)
+        normal = np.einsum("n,nip,njp->ij", say, rest, rest)
+        right = np.einsum("n,nip,np->i", say, rest, residual)
+        normal += 1e-3 * np.diag(np.diag(normal)) + 1e-9 * np.eye(4)
+        change = np.linalg.solve(normal, right)
+        change *= min(1.0, _MOST_STEP_PX / max(float(np.abs(change).max()), 1e-9))
+        by_own = np.matmul(inverse, np.matmul(own, residual[:, :, None]))[:, :, 0] - of_own @ change
+        by_own *= np.minimum(1.0, _MOST_STEP_PX / np.maximum(np.abs(by_own[:, :3]).max(axis=1), 1e-9))[:, None]
+        along = s.along + change
+        along[3] = np.clip(along[3], -0.9, 0.9)
+        along[:3] *= min(1.0, _REACH * radius / float(np.hypot(np.hypot(*along[:2]), along[2])))
+        s = _State(along, s.local + by_own[:, :2], np.clip(s.radius + by_own[:, 2], *RADIUS_PX), e.linear)
+    return s, left
+
+
+def _table(w: _Window, s: _State, odd: BallFits, optics: Optics, noise: NoiseModel) -> BallFits:
+    e = _equations(w, s, optics, noise)
+    weighted, shared, root, residual = e.own, e.shared, e.root, e.residual
+    n, side, depth = len(e.value), 2 * w.half + 1, e.linear[:, 0]
+    estimator = np.matmul(invert(np.matmul(weighted, weighted.transpose(0, 2, 1))), weighted)
+    of_linear = weighted[:, 3:]
+    alone = np.matmul(invert(np.matmul(of_linear, of_linear.transpose(0, 2, 1)))[:, :1], of_linear)
+    scatter = influence_covariance(np.concatenate([estimator[:, :4], alone], axis=1).reshape(n, 5, side, side), noise.correlation)
+    # what is not known of the spot moves all of them
+    moved = np.matmul(estimator, shared.transpose(0, 2, 1))
+    rest = shared - np.matmul(moved.transpose(0, 2, 1), weighted)
+    unknown = invert(np.einsum("nip,njp->ij", rest, rest)[None])[0] * noise.correlation.sum()
+    covariance = scatter[:, :4, :4] + np.einsum("nai,ij,nbj->nab", moved[:, :4], unknown, moved[:, :4])
+    distance = np.hypot(w.cols - s.local[:, :1], w.rows - s.local[:, 1:])
+    core: Bool = distance < (s.radius + optics.sigma_px)[:, None] + float(np.hypot(*spot_of(s.along).points.T).max())
+    square, weight = residual**2, root**2
+    seen = (core * w.valid).sum(axis=1)
+    counted = np.maximum(seen, 1.0)
+    bare = np.where(root > 0, residual / np.where(root > 0, root, 1.0), 0.0)
+    raised = weight * (bare + depth[:, None] * e.value) ** 2
+    ring, under = uneven(bare, weight, s.local, side, ~core), uneven_white(bare, weight, s.local, side, core, noise)
+    return replace(
+        odd,
+        position_px=s.local + w.corner,
+        radius_px=s.radius,
+        depth=depth,
+        covariance=covariance,
+        chi2_core=(square * core).sum(axis=1) / counted,
+        chi2_ring=ring,
+        chi2_uneven=under,
+        explained=1 - (square * core).sum(axis=1) / np.maximum((raised * core).sum(axis=1), 1e-12),
+        valid_fraction=seen / np.maximum(core.sum(axis=1), 1),
+        window_fraction=w.valid.mean(axis=1),
+        log_likelihood=-0.5 * square.sum(axis=1),
+        background=(e.linear[:, 1:] @ w.surface)[np.arange(n), distance.argmin(axis=1)],
+        significance=np.abs(depth) / np.sqrt(np.maximum(scatter[:, 4, 4], 1e-30)),
+        n_core=counted,
+        converged=np.ones(n, bool),
+    )
+
+
+def with_spot(others: Any, balls: BallFits, spot: Spot, optics: Optics) -> Any:
+    """Return what makes the images of these balls beside those of ``others``, at pixels (cols, rows)."""
+    reach = balls.radius_px + 4 * optics.sigma_px + float(np.hypot(*spot.points.T).max())
+
+    def images(cols: Float, rows: Float) -> Float:
+        total = np.zeros(cols.shape) if others is None else others(cols, rows)
+        low, high = np.array([cols.min(), rows.min()]), np.array([cols.max(), rows.max()])
+        at = balls.position_px
+        for k in np.flatnonzero(((at > low - reach[:, None]) & (at < high + reach[:, None])).all(axis=1)):
+            dx, dy = (axis.reshape(1, -1) - middle for axis, middle in zip((cols, rows), at[k], strict=True))
+            total = total + balls.depth[k] * spot_image(spot, dx, dy, balls.radius_px[[k]], optics).reshape(cols.shape)
+        return np.asarray(total)
+
+    return images

@@ -1,0 +1,191 @@
+"""Where marker images may be: a cheap multi-scale filter over the film in bands, recall first.
+
+Differences of Gaussians on a pyramid that starts at half resolution, in units of the local spread of the same filter (so that
+trabeculae raise the threshold where they are, and nowhere else). Both polarities come out of one pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import cycle
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.film.noise import NoiseModel, medians
+from rsa_vision.detect.search.junctions import find_junctions
+from rsa_vision.detect.search.strokes import COLUMNS, find_strokes, where_three_meet
+from rsa_vision.types import Float, Int
+
+BAND = 1024  # rows at full resolution that are in memory as float32 at once
+MARGIN = 128  # overlap of bands; more than the reach of the coarsest filter
+BLOCK = 32  # side of the blocks of one pyramid level over which the spread is measured
+# (pyramid level, inner sigma, outer sigma in pixels of that level, radius in film pixels that answers best)
+SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
+REACH = 3.0  # blur widths to which kernels go
+FAINT = 0.86  # of what counts as significant: extrema of so much are listed too, for looks that know what they look for
+ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
+JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for
+STROKE_SCALES = ((1, 2.6), (1, 4.4))  # those for single pins
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Local extrema of the filters.
+
+    Attributes
+    ----------
+    position_px : ndarray of shape (n, 2)
+        (col, row).
+    radius_px : ndarray of shape (n,)
+        Radius that the answering filter suits best.
+    strength : ndarray of shape (n,)
+        Filter answer in units of its local spread; positive for marks darker than their surroundings, negative for brighter ones.
+    roundness : ndarray of shape (n,)
+        Ratio of the smaller to the larger curvature at the extremum: 1 round, 0 a ridge.
+    junctions : ndarray of shape (m, 5)
+        Points where three arms may meet, as :func:`rsa_vision.detect.search.junctions.find_junctions`.
+    strokes : ndarray of shape (k, 6)
+        What may be single pins, strongest first, as :func:`rsa_vision.detect.search.strokes.find_strokes`.
+    """
+
+    position_px: Float
+    radius_px: Float
+    strength: Float
+    roundness: Float
+    junctions: Float
+    strokes: Float
+
+    def rows(self, index: Any) -> Candidates:
+        """Return the extrema that ``index`` selects, with all junctions and strokes."""
+        chosen = (self.position_px[index], self.radius_px[index], self.strength[index], self.roundness[index])
+        return Candidates(*chosen, self.junctions, self.strokes)
+
+
+def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> Candidates:
+    """Find local extrema of the multi-scale filter.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    threshold : float
+        Strength that counts, in units of the local spread; extrema down to ``FAINT`` of it are listed.
+    noise : NoiseModel
+        Its smallest variance is what the spread is at least taken for: saturated and blank areas have none of their own.
+
+    Returns
+    -------
+    Candidates
+        Strongest of neighbouring extrema first; both polarities.
+    """
+    found: list[Float] = []
+    junctions: list[Float] = []
+    strokes: list[Float] = []
+    rows = film.shape[0]
+    # kept from band to band: the first touch of new memory costs as much as a filter
+    work = np.empty((5, (min(rows, BAND + 2 * MARGIN) + 16) * (film.shape[1] + 16) // 4), np.float32)
+    for start in range(0, rows, BAND):
+        top, bottom = max(0, start - MARGIN), min(rows, start + BAND + MARGIN)
+        top -= top % 8
+        band = film[top:bottom]
+        stop = start + BAND if start + BAND < rows else rows + BAND
+        for into, table in zip((found, junctions, strokes), _band_extrema(band, threshold, noise, work), strict=True):
+            table[:, 1] += top
+            into.append(table[(table[:, 1] >= start) & (table[:, 1] < stop)])
+    table = np.concatenate(found)
+    table = table[np.argsort(-np.abs(table[:, 3]))]
+    strokes_found = np.concatenate(strokes)
+    strokes_found = strokes_found[np.argsort(-np.abs(strokes_found[:, 5]))]
+    joined = np.concatenate(junctions)
+    joined = np.concatenate([joined, where_three_meet(strokes_found, joined)])
+    return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], joined, strokes_found)
+
+
+def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work: NDArray[np.float32]) -> tuple[Float, Float, Float]:
+    """``work``: rows with room for the band at half resolution."""
+    pad = (-band.shape[0] % 8, -band.shape[1] % 8)
+    if any(pad):
+        band = cv2.copyMakeBorder(band, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
+    half = cv2.resize(band, (band.shape[1] // 2, band.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    image, limit, *others = (row[: half.size].reshape(half.shape) for row in work)
+    image[:] = half
+    room = cycle(others)  # three in turn: none is written to from itself
+    at, blurred = (1, 0.0), image
+    out = [np.zeros((0, 5))]
+    junctions, strokes = np.zeros((0, 5)), [np.zeros((0, COLUMNS))]
+    for level, inner, outer, radius in SCALES:
+        if level > at[0]:
+            image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+            limit, *others = (row[: image.size].reshape(image.shape) for row in work[1:])
+            room = cycle(others)
+            at, blurred = (level, 0.0), image
+        # outer minus inner: positive where the mark is darker than its surroundings
+        begun = _blurred(blurred, at[1], inner, next(room))
+        blurred = _blurred(begun, inner, outer, next(room))  # the next scale may begin with it
+        at = (level, outer)
+        answer = cv2.subtract(blurred, begun, dst=begun)
+        spread = _local_spread(answer, _white_spread(noise, level, inner, outer))
+        limit = cv2.resize(threshold * spread, (answer.shape[1], answer.shape[0]), dst=limit, interpolation=cv2.INTER_LINEAR)
+        significance = cv2.divide(answer, limit, dst=limit)
+        place = np.flatnonzero((significance > FAINT) | (significance < -FAINT))
+        strength = np.asarray(significance.ravel()[place], np.float64)
+        out.append(_extrema(answer, place, threshold * strength, level, radius))
+        clear = np.abs(strength) > 1
+        if (level, radius) == JUNCTION_SCALE:
+            junctions = find_junctions(significance, place[clear], strength[clear], level)
+        if (level, radius) in STROKE_SCALES:
+            strokes.append(find_strokes(answer, place[clear], strength[clear], level))
+    return np.concatenate(out), junctions, np.concatenate(strokes)
+
+
+def _blurred(image: NDArray[Any], by: float, sigma: float, into: NDArray[Any]) -> NDArray[Any]:
+    """Blur further what is blurred: shorter kernels than from the start."""
+    more = float(np.sqrt(sigma**2 - by**2))
+    if more == 0:
+        return image
+    side = 2 * round(REACH * more) + 1
+    return cv2.GaussianBlur(image, (side, side), more, dst=into)
+
+
+def _extrema(answer: NDArray[Any], place: Int, strength: Float, level: int, radius: float) -> Float:
+    row, col = np.divmod(place, answer.shape[1])
+    whole = (row > 0) & (row < answer.shape[0] - 1) & (col > 0) & (col < answer.shape[1] - 1)
+    row, col, strength = row[whole], col[whole], strength[whole]
+    # few pixels answer: to look around those costs less than filters of rank over all
+    for dr, dc in ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+        here = answer[row, col]
+        peak = np.copysign(1, here) * (here - answer[row + dr, col + dc]) >= 0
+        row, col, strength = row[peak], col[peak], strength[peak]
+    if len(row) == 0:
+        return np.zeros((0, 5))
+    centre = answer[row, col].astype(np.float64)
+    left, right, up, down = (answer[row + dr, col + dc] for dr, dc in ((0, -1), (0, 1), (-1, 0), (1, 0)))
+    dxx, dyy = left + right - 2 * centre, up + down - 2 * centre
+    dxy = (answer[row + 1, col + 1] + answer[row - 1, col - 1] - answer[row + 1, col - 1] - answer[row - 1, col + 1]) / 4
+    mean, spread_xy = (dxx + dyy) / 2, np.hypot((dxx - dyy) / 2, dxy)
+    roundness = (np.abs(mean) - spread_xy) / np.maximum(np.abs(mean) + spread_xy, 1e-12)
+    shift_c = np.clip((left - right) / (2 * np.where(dxx == 0, 1, dxx)), -0.5, 0.5)
+    shift_r = np.clip((up - down) / (2 * np.where(dyy == 0, 1, dyy)), -0.5, 0.5)
+    size = 2**level
+    position_c = (col + shift_c + 0.5) * size - 0.5
+    position_r = (row + shift_r + 0.5) * size - 0.5
+    return np.stack([position_c, position_r, np.full(len(row), radius), strength, roundness], axis=1)
+
+
+def _white_spread(noise: NoiseModel, level: int, inner: float, outer: float) -> float:
+    """Spread of a filter's answer to white noise of the film's smallest variance."""
+    gain = 1 / (4 * np.pi * inner**2) + 1 / (4 * np.pi * outer**2) - 1 / (np.pi * (inner**2 + outer**2))
+    return float(np.sqrt((noise.variance.min() + ROUNDING) * gain) / 2**level)
+
+
+def _local_spread(answer: NDArray[Any], least: float) -> NDArray[Any]:
+    """Median absolute deviation in blocks, as a standard deviation, on the grid of the blocks."""
+    n_rows, n_cols = max(1, answer.shape[0] // BLOCK), max(1, answer.shape[1] // BLOCK)
+    block_r, block_c = min(BLOCK, answer.shape[0]), min(BLOCK, answer.shape[1])
+    # every third pixel in either direction: the filter's own correlation makes the others nearly copies
+    part = np.abs(answer[: n_rows * block_r, : n_cols * block_c].reshape(n_rows, block_r, n_cols, block_c)[:, 1::3, :, 1::3])
+    middle = medians(part.swapaxes(1, 2).reshape(n_rows, n_cols, -1)) / 0.6745
+    spread: NDArray[Any] = np.maximum(middle, least).astype(np.float32)
+    return spread
