@@ -151,19 +151,24 @@ def _blurred(image: NDArray[Any], by: float, sigma: float, into: NDArray[Any]) -
 
 def _extrema(answer: NDArray[Any], place: Int, strength: Float, level: int, radius: float) -> Float:
     row, col = np.divmod(place, answer.shape[1])
-    whole = (row > 0) & (row < answer.shape[0] - 1) & (col > 0) & (col < answer.shape[1] - 1)
-    row, col, strength = row[whole], col[whole], strength[whole]
+    last_r, last_c = answer.shape[0] - 1, answer.shape[1] - 1
+
+    def at(dr: int, dc: int) -> NDArray[Any]:
+        """Beyond the border is its mirror image, as the filter has it: balls cut off there have their extremum on it."""
+        beside: NDArray[Any] = answer[last_r - np.abs(last_r - np.abs(row + dr)), last_c - np.abs(last_c - np.abs(col + dc))]
+        return beside
+
     # few pixels answer: to look around those costs less than filters of rank over all
     for dr, dc in ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)):
         here = answer[row, col]
-        peak = np.copysign(1, here) * (here - answer[row + dr, col + dc]) >= 0
+        peak = np.copysign(1, here) * (here - at(dr, dc)) >= 0
         row, col, strength = row[peak], col[peak], strength[peak]
     if len(row) == 0:
         return np.zeros((0, 5))
     centre = answer[row, col].astype(np.float64)
-    left, right, up, down = (answer[row + dr, col + dc] for dr, dc in ((0, -1), (0, 1), (-1, 0), (1, 0)))
+    left, right, up, down = (at(*step) for step in ((0, -1), (0, 1), (-1, 0), (1, 0)))
     dxx, dyy = left + right - 2 * centre, up + down - 2 * centre
-    dxy = (answer[row + 1, col + 1] + answer[row - 1, col - 1] - answer[row + 1, col - 1] - answer[row - 1, col + 1]) / 4
+    dxy = (at(1, 1) + at(-1, -1) - at(1, -1) - at(-1, 1)) / 4
     mean, spread_xy = (dxx + dyy) / 2, np.hypot((dxx - dyy) / 2, dxy)
     roundness = (np.abs(mean) - spread_xy) / np.maximum(np.abs(mean) + spread_xy, 1e-12)
     shift_c = np.clip((left - right) / (2 * np.where(dxx == 0, 1, dxx)), -0.5, 0.5)
