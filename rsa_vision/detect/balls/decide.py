@@ -143,7 +143,7 @@ def faint_beside(fits: BallFits, needles: list[NeedleFit], sigma_px: float, nois
     """
     if len(needles) < LEAST_KNOWN:
         return np.zeros(len(fits.depth), bool)
-    height, background = np.abs([[f.depth, f.background] for f in needles]).T
+    height, background = np.abs([[f.height, f.background] for f in needles]).T
     mine, noises = height_of(fits, sigma_px), [np.sqrt(noise.variance_at(at)) for at in (fits.background, background)]
     low = mine < FAINT * np.quantile(height, _LOW)
     return np.asarray(low & (mine / noises[0] < FAINT * np.quantile(height / noises[1], _LOW)))

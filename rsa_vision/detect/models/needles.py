@@ -22,7 +22,7 @@ from rsa_vision.types import Bool, Float, Int
 Images = Callable[[Float, Float], Float]
 """Images of some marks at pixels (cols, rows), in film values over the background."""
 _Key = tuple[float, float, float, Optics]  # of a table: half width, length, taper
-CELL, CELL_OF_BLUR = 0.3, 0.4  # pixels between the nodes of a needle table, and part of the blur where that is more
+CELL, CELL_OF_BLUR = 0.3, 0.2  # pixels between the nodes of a needle table, and part of the blur where that is more
 GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
 _LOG_GRID = math.log(GRID)
@@ -73,6 +73,8 @@ class NeedleFit:
     converged : bool
     slants : ndarray of shape (2, k), optional
         How the rays cross each thick end, once it has been asked for: the square of their slope along the arm, and the skew of the end.
+    height : float
+        Largest difference from the background in its image; the depth is what full opacity would come to.
     """
 
     position_px: Float
@@ -91,6 +93,7 @@ class NeedleFit:
     significance: float
     converged: bool
     slants: Float | None = None
+    height: float = 0.0
 
 
 @lru_cache(maxsize=1024)

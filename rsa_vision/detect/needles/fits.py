@@ -173,6 +173,7 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
         explained=1.0 - left / max(raised, 1e-12),
         misfit=float(np.sqrt(max(chi2_core - 1.0, 0.0) * variance) / max(high, 1e-9)),
         significance=significance_of(image, surface, weight),
+        height=peak,
     )
 
 

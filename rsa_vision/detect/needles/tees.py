@@ -18,6 +18,7 @@ from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.covered import find_covered
 from rsa_vision.detect.needles.crossing import chi2_of, fit_crossing, moved, window_of
+from rsa_vision.detect.needles.ends import goes_on
 from rsa_vision.detect.needles.fits import explains, fit_needles
 from rsa_vision.detect.needles.optics import common_optics
 from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, others_beside
@@ -83,6 +84,9 @@ def find_tees(
         return others_beside(mine, [t for t in around if all(t is not m for m in mine)], optics)
 
     tees = split_twins(film, tees, optics, noise, is_tee, beside)
+    tees = [t for t in tees if not goes_on(film, t, optics, others_beside(t, [o for o in tees if o is not t], optics))]
+    if not tees:
+        return [], [], optics
     if optics.rough:
         optics = common_optics(film, tees, optics, noise)  # where arms cross hardly depends on where they end
         tees = fit_all(film, tees, optics, noise)

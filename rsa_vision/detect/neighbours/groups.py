@@ -21,7 +21,7 @@ from rsa_vision.detect.models.profiles import ball_table
 from rsa_vision.types import Float
 
 _STEPS = 25
-_CONVERGED_PX = 5e-3  # a step's change: the last step leaves far less
+_CONVERGED_PX = 1e-3
 _MOST_PX, _LAST_PX = 0.5, 1.0  # of a step; of the last one, which is not held near: from farther off no straight line leads there
 _MOST_RADII = 0.12  # of a step, of large balls
 _ARRIVED = 12  # steps after which what still takes the longest ones is nowhere near

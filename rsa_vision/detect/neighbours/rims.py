@@ -45,7 +45,7 @@ def goes_on(film: NDArray[Any], balls: BallFits, number: Int, beside: Beside, si
         reach = np.append(np.repeat([0.0, _WITHIN], [1, len(_DIRECTIONS)]) * radius, np.full(len(_DIRECTIONS), radius + BEYOND * sigma_px))
         angle = np.concatenate([[0.0], _DIRECTIONS, _DIRECTIONS])
         cols, rows = place[0] + reach * np.cos(angle), place[1] + reach * np.sin(angle)
-        values = np.sign(depth) * (_sample(film, cols, rows) - beside(int(number[i]), cols, rows)[0])
+        values = np.sign(depth) * (sample(film, cols, rows) - beside(int(number[i]), cols, rows)[0])
         middle, around = np.median(values[: -len(_DIRECTIONS)]), values[-len(_DIRECTIONS) :]
         around = (np.roll(around, 1) + around + np.roll(around, -1)) / 3
         low = np.percentile(around, 25)
@@ -56,7 +56,7 @@ def goes_on(film: NDArray[Any], balls: BallFits, number: Int, beside: Beside, si
     return out
 
 
-def _sample(film: NDArray[Any], cols: Float, rows: Float) -> Float:
+def sample(film: NDArray[Any], cols: Float, rows: Float) -> Float:
     """Values between pixels, of a film that goes on beyond its border as it ends there."""
     corner = np.floor([cols.min(), rows.min()]).astype(int).clip(0, np.array(film.shape[::-1]) - 1)
     end = np.ceil([cols.max(), rows.max()]).astype(int).clip(corner, np.array(film.shape[::-1]) - 1) + 1
