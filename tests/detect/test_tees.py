@@ -9,37 +9,58 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.balls.find import STRENGTH
+from rsa_vision.detect.balls.decide import faint_beside
+from rsa_vision.detect.balls.find import STRENGTH, fit_at
 from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles import shared, tees
+from rsa_vision.detect.needles.ends import goes_on
 from rsa_vision.detect.needles.tees import find_tees, is_tee, optics_of_tees
 from rsa_vision.detect.search.candidates import find_candidates
 from rsa_vision.types import Float
 
+from .films import film_of_balls, stored
 from .test_covered import CELLS, SIDE, SIGMA_PX, check, exposed, light_past_tees, tips_of
+
+_TEE = NeedleFit(
+    np.zeros(2), np.array([0.0, np.pi / 2, -np.pi / 2]), NeedleShape(2.0, 16.0), np.full(3, -900.0), -900.0, 4e4, np.eye(2) * 1e-4, 190,
+    1.0, 1.0, 0.98, 1.0, 0.0, 80.0, True,
+)  # fmt: skip
 
 
 def test_arms_of_a_few_pixels_are_no_tee() -> None:
-    quarter = np.pi / 2
-    shape = NeedleShape(2.0, 16.0)
-    fit = NeedleFit(
-        np.zeros(2), np.array([0.0, quarter, -quarter]), shape, np.full(3, -900.0), -900.0, 4e4, np.eye(2) * 1e-4, 190, 1.0, 1.0, 0.98, 1.0,
-        0.0, 80.0, True,
-    )  # fmt: skip
-    assert is_tee(fit)
-    assert not is_tee(replace(fit, n_core=10))  # within a ball three short arms explain all of their ten pixels
-    assert not is_tee(replace(fit, shape=NeedleShape(1.6, 5.2)))
+    assert is_tee(_TEE)
+    assert not is_tee(replace(_TEE, n_core=10))  # within a ball three short arms explain all of their ten pixels
+    assert not is_tee(replace(_TEE, shape=NeedleShape(1.6, 5.2)))
+
+
+@pytest.mark.parametrize(("reach", "on"), [(17.0, False), (60.0, True)])
+def test_arms_that_go_on_beyond_their_ends_are_wires(reach: float, on: bool) -> None:
+    rows, cols = np.mgrid[0:121, 0:121] - 60.0
+    bars = ((np.abs(cols) < 2) & (np.abs(rows) < reach) & (rows > -2)) | ((np.abs(rows) < 2) & (np.abs(cols) < reach))
+    film = np.rint(40000 - 20000 * gaussian_filter(bars.astype(float), SIGMA_PX)).astype(np.uint16)
+    angles, shape = np.array([-np.pi / 2, 0.0, np.pi]), NeedleShape(2.0, 17.0)
+    fit = replace(_TEE, position_px=np.array([60.0, 60.0]), angles=angles, shape=shape)
+    assert goes_on(film, fit, Optics(SIGMA_PX, 0.5), None) == on
+    film[:, np.abs(cols[0]) > 17] = 40000
+    assert not goes_on(film, fit, Optics(SIGMA_PX, 0.5), None)  # one arm may point at something by chance
+
+
+def test_balls_are_not_faint_beside_thin_needles() -> None:
+    """Their depth is what full opacity would come to; five crossings of wires hid all 49 balls of a film."""
+    film = stored(film_of_balls((400, 400), np.array([[100.0, 100.0], [300.0, 100.0], [200.0, 300.0]]), np.full(3, 4.0), noise_sd=300.0))
+    noise = estimate_noise(film, 16)
+    balls = fit_at(film, np.array([[100.0, 100.0]]), np.array([4.0]), Optics(1.0, 0.5), noise)
+    thin = replace(_TEE, depth=-3e5, height=1.5e4)
+    assert not faint_beside(balls, [thin] * 5, 1.0, noise).any()
+    assert faint_beside(balls, [replace(thin, height=3e5)] * 5, 1.0, noise).all()
 
 
 def test_nothing_left_of_what_looked_like_tees_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     film = np.full((300, 300), 1000, np.uint16)
-    model = NeedleFit(
-        np.array([150.0, 150]), np.array([0.0, 1.5, -1.5]), NeedleShape(2.0, 16.0), np.full(3, -90.0), -90.0, 1e3, np.eye(2), 190, 1.0, 1.0,
-        0.98, 1.0, 0.0, 80.0, True,
-    )  # fmt: skip
+    model = replace(_TEE, position_px=np.array([150.0, 150.0]), depth=-90.0, background=1e3)
     monkeypatch.setattr(tees, "_models", lambda *_: ([model], []))
     monkeypatch.setattr(tees, "_like", lambda *_: [])
     optics = Optics(1.0, 0.5)
