@@ -122,6 +122,9 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     sure &= high_enough
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
+    if not mottled:  # smaller ones may be too faint for a pattern; where all around is noise, several of one size are marks as well
+        quiet = sure & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.chi2_ring < _QUIET) & (strength > ALONE)
+        alike |= quiet & (fits.radius_px < high) & (_of_like_spread(_spread(fits, sigma_px), quiet) >= LEAST_KNOWN)
     return np.asarray((fits.significance > limit) & alike & (sure | (strength > 0.5 * SURE)))
 
 

@@ -17,8 +17,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 _STEPS = 14
-# times the height of an image: a depth beyond that is what thin opacity would come to, and no measure; no metal is thinner than that
-_DEEPER, _DEEPEST = 2.0, 30.0
+_DEEPER = 2.0  # times the height of an image: a depth beyond that is what thin opacity would come to, and no measure
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
 _CLOSE_PX = 0.1
 _MOVES = 5  # tip, half width, length, direction
@@ -158,7 +157,7 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
     core = under(image)
     n_core = int(core.sum())
     peak = float(np.abs(image).max(initial=0.0))
-    high = min(abs(depth), _DEEPER * peak) if abs(depth) < _DEEPEST * peak else 0.0
+    high = min(abs(depth), _DEEPER * peak)
     left = float(square[core].sum())
     raised = float((weight * (residual + image) ** 2)[core].sum())
     chi2_core = left / n_core if n_core else np.inf

@@ -24,7 +24,7 @@ _STEPS = 25
 _CONVERGED_PX = 1e-3
 _MOST_PX, _LAST_PX = 0.5, 1.0  # of a step; of the last one, which is not held near: from farther off no straight line leads there
 _MOST_RADII = 0.12  # of a step, of large balls
-_ARRIVED = 12  # steps after which what still takes the longest ones is nowhere near
+_ARRIVED = 12  # steps after which what still takes the longest ones is lost
 _LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
 _MOST_BENT = 1.0  # half windows to a radius
 KNOTS = 1.5  # blur widths between the knots of a profile across an edge
@@ -65,7 +65,8 @@ def fit_group(
     Returns
     -------
     BallFits
-        One row a ball; figures of merit are taken under the ball, with all balls modelled.
+        One row a ball; figures of merit are taken under the ball, with all balls modelled. Nothing is seen of one that got lost
+        (``valid_fraction`` 0).
     """
     k = len(start_px)
     window = window_around(film, start_px, start_radius_px, sigma_px, noise, others)
@@ -81,12 +82,12 @@ def fit_group(
         images = images_in(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     ground: Float | None = None
-    converged, lost, before = False, False, np.zeros((3, k))
+    converged, lost, before = False, np.zeros(k, bool), np.zeros((3, k))
     most = max(_MOST_PX, _MOST_RADII * float(radius.min()))
     for step in range(_STEPS + 1):
         value, linear, jac = images.value, images.linear, images.jacobian(theta)
         residual = data - linear @ theta
-        if step == _STEPS or converged or lost:
+        if step == _STEPS or converged or lost.any():
             break
         if step in (4, 10):
             weight = valid / noise.variance_at(linear @ theta + window.neighbours)
@@ -99,7 +100,7 @@ def fit_group(
         before = move
         local = local + scale * move[:2].T
         radius = np.clip(radius + scale * move[2], low, high)
-        converged, lost = step > 2 and farthest < _CONVERGED_PX, step >= _ARRIVED and farthest > most
+        converged, lost = step > 2 and farthest < _CONVERGED_PX, (np.abs(move).max(axis=0) > most) & (step >= _ARRIVED)
         if edge:
             if taken:
                 ground = _under(images.value, surface @ theta[k : k + surface.shape[1]])
@@ -131,7 +132,7 @@ def fit_group(
         chi2_ring=uneven(of_all, np.broadcast_to(weight * ring, of_all.shape), local, size, ~core),
         chi2_uneven=uneven_white(of_all, np.broadcast_to(weight, of_all.shape), local, size, core, noise),
         explained=1 - (square * core).sum(1) / np.maximum((raised * core).sum(1), 1e-12),
-        valid_fraction=(core * valid).sum(1) / np.maximum(core.sum(1), 1),
+        valid_fraction=np.where(lost, 0.0, (core * valid).sum(1) / np.maximum(core.sum(1), 1)),
         window_fraction=np.full(k, valid.mean()),
         log_likelihood=np.full(k, -0.5 * square.sum()),
         background=(surface @ theta[k : k + surface.shape[1]])[distance.argmin(1)],
