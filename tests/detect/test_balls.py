@@ -171,6 +171,7 @@ def test_balls_over_the_edge_of_the_film_are_found_flagged_and_no_worse_than_sta
     index, gap = nearest(edge, found)
     assert gap.max() < 0.3 * radius_px
     assert (found.images.flags[index] & MarkerFlag.EDGE).all()
+    assert not (found.images.flags[index] & MarkerFlag.OVERLAP).any()  # nothing is beyond the border
     error, covariance = found.images.position_px[index] - edge, found.images.covariance_px2[index]
     ratio = np.sqrt(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error).mean() / 2)
     print(f"radius {radius_px}: error / sd {ratio:.2f}")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.models.needles import Images, NeedleFit
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.rims import sample
+from rsa_vision.detect.neighbours.rims import on_film, sample
 
 _BEYOND = 3.0  # blur widths past the end, and aside of the arm, where nothing of it is left
 _ON_THE_ARM = 0.75  # of its length: as high as anywhere, and none of its end
@@ -41,5 +41,5 @@ def goes_on(film: NDArray[Any], tee: NeedleFit, optics: Optics, others: Images |
     if others is not None:
         values = values - others(cols.ravel(), rows.ravel())
     middle, *sides = values.reshape(cols.shape).swapaxes(0, 1)
-    height = np.sign(tee.depth) * (middle - np.mean(sides, axis=0))
+    height = np.sign(tee.depth) * (middle - np.mean(sides, axis=0)) * on_film(film, cols[:, 0], rows[:, 0])
     return bool(((height[:, 0] > 0) & (height[:, 1:].mean(axis=1) > _AS_HIGH * height[:, 0])).sum() > 1)

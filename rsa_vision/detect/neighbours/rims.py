@@ -47,6 +47,8 @@ def goes_on(film: NDArray[Any], balls: BallFits, number: Int, beside: Beside, si
         cols, rows = place[0] + reach * np.cos(angle), place[1] + reach * np.sin(angle)
         values = np.sign(depth) * (sample(film, cols, rows) - beside(int(number[i]), cols, rows)[0])
         middle, around = np.median(values[: -len(_DIRECTIONS)]), values[-len(_DIRECTIONS) :]
+        seen = on_film(film, cols, rows)[-len(_DIRECTIONS) :]
+        around = np.where(seen, around, np.percentile(around[seen], 25) if seen.any() else 0.0)
         around = (np.roll(around, 1) + around + np.roll(around, -1)) / 3
         low = np.percentile(around, 25)
         height = (around - low) / max(middle - low, 1e-9)
@@ -54,6 +56,11 @@ def goes_on(film: NDArray[Any], balls: BallFits, number: Int, beside: Beside, si
         opposite = np.minimum(height, np.roll(height, len(_DIRECTIONS) // 2))
         out[i] = (narrow and height.max() > AS_HIGH) or opposite.max() > AS_HIGH
     return out
+
+
+def on_film(film: NDArray[Any], cols: Float, rows: Float) -> Bool:
+    """Say which places lie on the film."""
+    return np.asarray((cols > -0.5) & (cols < film.shape[1] - 0.5) & (rows > -0.5) & (rows < film.shape[0] - 0.5))
 
 
 def sample(film: NDArray[Any], cols: Float, rows: Float) -> Float:
