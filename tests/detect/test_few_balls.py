@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from rsa_vision.detect import detect_markers
+from rsa_vision.detect.balls.find import fit_at
+from rsa_vision.detect.balls.optics import estimate_optics
+from rsa_vision.detect.film.noise import estimate_noise
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.flags import MarkerFlag
 
 from .films import film_of_balls, grid_of_balls, stored
@@ -158,3 +164,20 @@ def test_logarithmic_films_whose_noise_differs_from_mark_to_mark(depth: float, t
     print(f"{found_of_all} of 108, error / sd {ratio:.2f}")
     assert found_of_all >= 92  # a lost one costs less than a wrong one
     assert 0.8 < ratio < 1.3
+
+
+def test_a_first_look_that_has_left_the_film_says_nothing_of_the_blur() -> None:
+    """Three steps from the border a fit may end beyond it, where no pixel speaks against it."""
+    rng = np.random.default_rng(0)
+    truth = np.array([[50.0, 60.0], [150.0, 70.0], [60.0, 150.0], [140.0, 140.0]])
+    film = stored(film_of_balls((200, 200), truth, np.full(4, 3.0), depth=DEPTH, noise_sd=DEPTH * BACKGROUND / 10, rng=rng))
+    noise = estimate_noise(film, 16)
+    places = np.vstack([truth, [[100.0, 208.0]]])
+    looks = fit_at(film, places, np.full(5, 1.4), Optics(1.0, 0.5), noise)
+    assert looks.valid_fraction[-1] == 0.0
+    assert looks.explained[-1] == 0.0
+    everywhere = replace(looks, valid_fraction=np.ones(5), window_fraction=np.ones(5))  # as a fit may be called that leaves only now
+    with np.errstate(divide="raise", invalid="raise"):
+        optics, evidence = estimate_optics(film, everywhere, noise)
+    assert 0.7 < optics.sigma_px < 1.4
+    assert evidence > 1.0

@@ -218,7 +218,8 @@ def fit_balls(
     counted = (core * valid[:, :reached]).sum(1)
     core_n = np.maximum(counted, 1.0)
     left, total = (s.sum(1, dtype=np.float64) for s in (square[:, :reached] * core, square))
-    raised = weight[:, :reached] * (residual[:, :reached] + depth[:, None].astype(np.float32) * seen[:, 3]) ** 2 * core
+    without = residual[:, :reached] + depth[:, None].astype(np.float32) * seen[:, 3]
+    raised = (weight[:, :reached] * without**2 * core).sum(1, dtype=np.float64)
     chi2_ring = chi2_uneven = (total - left) / np.maximum(valid.sum(1) - counted - 10, 1.0)
     if not quick:
         of_all = np.concatenate([whole, np.pad(1 / normal[:, 3:, 3:], ((0, 0), (0, 0), (3, 0)))], axis=1)
@@ -243,7 +244,7 @@ def fit_balls(
         chi2_core=left / core_n,
         chi2_ring=chi2_ring,
         chi2_uneven=chi2_uneven,
-        explained=1.0 - left / np.maximum(raised.sum(1, dtype=np.float64), 1e-12),
+        explained=np.where(raised > 0, 1.0 - left / np.maximum(raised, 1e-12), 0.0),
         valid_fraction=counted / np.maximum(core.sum(1), 1),
         window_fraction=valid.sum(1, dtype=np.float64) / own.sum(1),
         log_likelihood=-0.5 * total,

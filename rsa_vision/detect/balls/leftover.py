@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -81,15 +82,39 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least
     image = fits.depth[:, None] * ball_image(cols - local[:, :1], rows - local[:, 1:], fits.radius_px, guess.sigma_px, guess.mu_px)
     left, model = patches.values.reshape(image.shape) - image, fits.background[:, None] + image
 
-    def more(doublings: float) -> float:
-        trial = noise.carried_on(end + sign * farthest, 2.0**doublings)
+    def under(trial: NoiseModel) -> float:
         return float(np.quantile(_ripple(left, trial.variance_at(model), local, fits.radius_px + guess.sigma_px), _QUARTILE))
 
     usual = float(np.quantile(beside, _QUARTILE))
-    if more(0.0) < (1 + max(_MORE, _BY_CHANCE / np.sqrt(_pixels(fits)))) * usual:
+    if not worth_it(under(noise) / usual, _pixels(fits)):
         return noise
-    doublings = np.interp(-usual, [-more(d) for d in _DOUBLINGS], _DOUBLINGS)
-    return noise.carried_on(end + sign * farthest, 2.0**doublings)
+    return carried_to(noise, end + sign * farthest, under, usual)
+
+
+def worth_it(more: float, pixels: float) -> bool:
+    """Say whether what so many pixels leave under marks, in units of what is left beside them, is more than chance, and worth a curve."""
+    return bool(more > 1 + max(_MORE, _BY_CHANCE / np.sqrt(pixels)))
+
+
+def carried_to(noise: NoiseModel, value: float, under: Callable[[NoiseModel], float], usual: float) -> NoiseModel:
+    """Return the noise with its curve carried on to a value such that what is left under marks is the usual.
+
+    Parameters
+    ----------
+    noise : NoiseModel
+    value : float
+        Beyond its curve.
+    under : callable
+        What is left under marks in units of the variance, given the noise.
+    usual : float
+        The same where there are no marks.
+
+    Returns
+    -------
+    NoiseModel
+    """
+    left = [-under(noise.carried_on(value, 2.0**d)) for d in _DOUBLINGS]
+    return noise.carried_on(value, 2.0 ** float(np.interp(-usual, left, _DOUBLINGS)))
 
 
 def _pixels(fits: BallFits) -> float:

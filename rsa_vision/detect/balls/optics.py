@@ -219,7 +219,8 @@ def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Floa
         out.left[index] = np.square(target).sum((1, 2))
         windows = rest.reshape(len(index), 2, patches.size, patches.size)
         scatter = influence_covariance(windows, noise.correlation)
-        out.spread[index] = 0.5 * np.einsum("nij,nji->n", invert(out.normal[index]), scatter)
+        spread = 0.5 * np.einsum("nij,nji->n", invert(out.normal[index]), scatter)
+        out.spread[index] = np.where(spread > 0, spread, 1.0)  # a fit that has left the film says nothing
     return out
 
 

@@ -16,8 +16,9 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.pairs import optics_of_pairs
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.noise_along import noise_under_needles
 from rsa_vision.detect.needles.pins import is_slim, look_for_pins, on_pins, optics_of_pins
-from rsa_vision.detect.needles.tees import optics_of_tees
+from rsa_vision.detect.needles.tees import GUESS, first_tees, optics_of_tees
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Float
 
@@ -149,14 +150,18 @@ def polarities(
         if pairs is not None:
             optics[sign], balls, found = pairs
             looks[sign] = distinct(join([found, mine]), noises[sign])
-        if clear.any() and balls < max(_LEAST_EVIDENCE, _OF_A_TEE * clear.sum()):
-            optics[sign] = optics_of_tees(film, candidates.junctions[clear], noise)
-        elif balls < _LEAST_EVIDENCE:
-            of_pins, balls = optics_of_pins(
-                film, [p for p in pins + look_for_pins(film, candidates.strokes, noise) if np.sign(p.depth) == sign], noise
-            )
-            if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
-                optics[sign] = of_pins
+        if balls < max(_LEAST_EVIDENCE, _OF_A_TEE * np.count_nonzero(clear)):
+            tees = first_tees(film, candidates.junctions[clear if clear.any() else strength > 0], noises[sign])
+            if noises[sign] is noise:
+                noises[sign] = noise_under_needles(film, tees or slim, GUESS, noise)
+            of_tees, known = optics_of_tees(film, tees, noises[sign])
+            if clear.any() or known:
+                optics[sign] = of_tees
+            elif balls < _LEAST_EVIDENCE:
+                more = look_for_pins(film, candidates.strokes, noises[sign])
+                of_pins, balls = optics_of_pins(film, [p for p in pins + more if np.sign(p.depth) == sign], noises[sign])
+                if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
+                    optics[sign] = of_pins
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and len(seeds.depth) == 0:

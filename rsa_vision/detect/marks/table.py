@@ -29,6 +29,7 @@ _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
 _UNLIKE = 2.0  # times the misfit that is usual on the film
+_ROOM = 2.0  # standard deviations: nearer to an end of the range the mean of what is left of the noise is not that of the film
 _OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
 
 
@@ -106,6 +107,7 @@ def table_of(
     valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in tees]])
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
+    flags[n:][[_noise_is_cut_off(t, noise) for t in tees]] |= MarkerFlag.SATURATED | MarkerFlag.CLIPPED
     flags[:n][touching] |= MarkerFlag.OVERLAP
     arms = np.array([len(t.angles) for t in tees])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
@@ -133,3 +135,12 @@ def table_of(
     high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
     trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
+
+
+def _noise_is_cut_off(fit: NeedleFit, noise: NoiseModel) -> bool:
+    """Say whether an end of the range cuts off the noise beside a needle, into which the image of its tip fades out.
+
+    The middle of a ball is where it was, however much its rims have suffered.
+    """
+    room = min(fit.background - noise.floor, noise.ceiling - fit.background)
+    return bool(room < _ROOM * np.sqrt(noise.variance_at(np.array([fit.background]))[0]))

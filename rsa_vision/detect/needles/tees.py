@@ -43,6 +43,7 @@ _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
 _ASKED = 3  # cleanest tees that tell blur and taper
 _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
+GUESS = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
 
 
@@ -112,8 +113,8 @@ def _apart(rough: list[NeedleFit], known: list[NeedleFit], gap_px: float) -> lis
     return [t for t in rough if all(math.dist(t.position_px, k.position_px) > gap_px for k in known)]
 
 
-def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> Optics:
-    """Estimate the blur from the cleanest tees at junctions, for films without balls.
+def first_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> list[NeedleFit]:
+    """Fit tees at junctions with guessed optics.
 
     Parameters
     ----------
@@ -123,21 +124,39 @@ def optics_of_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> O
 
     Returns
     -------
-    Optics
+    list of NeedleFit
+        The few cleanest of what may be tees.
     """
     strongest = junctions[np.argsort(-np.abs(junctions[:, 4]))][:_MOST_JUNCTIONS]
-    # the very strongest are where arms cross, and of what is no tee the widest blur leaves least
-    cleanest = _at_junctions(film, strongest, TAPERS[0], Optics(COARSE_SIGMA_PX, COARSE_MU_PX), noise)[:_ASKED]
+    return _at_junctions(film, strongest, TAPERS[0], GUESS, noise)[:_ASKED]
 
-    windows = [window_of(film, [f], Optics(_BLURS_PX[-1], COARSE_MU_PX), noise, None) for f in cleanest]
+
+def optics_of_tees(film: NDArray[Any], cleanest: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, bool]:
+    """Estimate the blur from the cleanest tees, for films without balls.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    cleanest : list of NeedleFit
+        As of :func:`first_tees`.
+    noise : NoiseModel
+
+    Returns
+    -------
+    optics : Optics
+    known : bool
+        There are tees that tell it; else it is guessed.
+    """
+    # the very strongest are where arms cross, and of what is no tee the widest blur leaves least
+    windows = [window_of(film, [f], replace(GUESS, sigma_px=_BLURS_PX[-1]), noise, None) for f in cleanest]
     fits, left = {}, {}
     for sigma in _BLURS_PX:
-        optics = Optics(sigma, COARSE_MU_PX)
+        optics = replace(GUESS, sigma_px=sigma)
         fits[sigma] = [fit_needles(film, f.position_px, f.angles, f.shape, optics, noise) for f in cleanest]
         left[sigma] = sum(chi2_of(window, f, optics, noise) for window, f in zip(windows, fits[sigma], strict=True))
     best = min(left, key=lambda sigma: left[sigma])
     known = any(is_tee(f, slack=_BEFORE) for f in fits[best])
-    return Optics(best if known else COARSE_SIGMA_PX, COARSE_MU_PX, rough=True)
+    return replace(GUESS, sigma_px=best if known else COARSE_SIGMA_PX, rough=True), known
 
 
 def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
