@@ -8,6 +8,7 @@ from rsa_vision.detect import detect_markers
 from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.needles.pins import is_pin
+from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin
 
@@ -173,3 +174,16 @@ def test_what_lies_over_pins_is_part_of_their_errors_and_is_no_ball() -> None:
     print(f"error / stated {ratio:.2f}; largest {np.sqrt(np.max(square)):.1f}")
     assert 0.6 < ratio < 1.4
     assert np.max(square) < 4.0**2
+
+
+@pytest.mark.parametrize(("room", "flagged"), [(1.0, True), (6.0, False)])
+def test_noise_that_the_end_of_the_range_cuts_off_beside_a_tip_is_told(room: float, flagged: bool) -> None:
+    """What is left of it has another mean, so that tips where the image fades out seem to lie elsewhere: 3 sd and more, all alike."""
+    rng = np.random.default_rng(4)
+    film, tips, _ = film_of_pins(rng, quanta=1e6)
+    noise_sd = 0.06 * float(film.max())
+    noisy = film + rng.normal(0, noise_sd, film.shape)
+    values = np.clip(np.rint(noisy * 255 / (np.median(film) + room * noise_sd)), 0, 255).astype(np.uint8)
+    found = detect_markers(values, bits=8).images
+    assert len(found) >= len(tips) - 2
+    assert (((found.flags & MarkerFlag.CLIPPED) > 0) == flagged).all()

@@ -17,7 +17,8 @@ from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles import shared, tees
 from rsa_vision.detect.needles.ends import goes_on
-from rsa_vision.detect.needles.tees import find_tees, is_tee, optics_of_tees
+from rsa_vision.detect.needles.noise_along import noise_under_needles
+from rsa_vision.detect.needles.tees import GUESS, find_tees, first_tees, is_tee, optics_of_tees
 from rsa_vision.detect.search.candidates import find_candidates
 from rsa_vision.types import Float
 
@@ -88,8 +89,30 @@ def test_blur_comes_from_clean_tees_where_crossing_arms_look_stronger(seed: int)
     gap = np.hypot(*(junctions[:, None, :2] - tips).transpose(2, 0, 1)).min(axis=1)
     junctions[gap > 6.0, 4] *= 100.0
     assert np.count_nonzero(gap > 6.0) > 6
-    optics = optics_of_tees(film, junctions, noise)
+    optics, known = optics_of_tees(film, first_tees(film, junctions, noise), noise)
+    assert known
     assert 0.8 < optics.sigma_px / np.hypot(SIGMA_PX, np.sqrt(1 / 12)) < 1.25
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_under_tees_that_no_tile_of_the_film_tells(seed: int) -> None:
+    """One over the exposure, as of light through a film: twenty times the variance under tees."""
+    rng = np.random.default_rng(seed)
+    tips = tips_of(rng)
+    seen = 0.3 + 0.7 * gaussian_filter(light_past_tees(tips, np.ones(len(tips))), SIGMA_PX)
+    counts = rng.poisson(seen * 120.0) / 120.0
+    film = np.clip(np.rint(10000 / counts), 0, 65535).astype(np.uint16)
+    noise = estimate_noise(film, 16)
+    junctions = find_candidates(film, STRENGTH, noise).junctions
+    told = noise_under_needles(film, first_tees(film, junctions[junctions[:, 4] < 0], noise), GUESS, noise)
+    top = told.level[-1]
+    expected = (noise.variance_at(noise.level[-1:]) * (top / noise.level[-1]) ** 3)[0]
+    print(f"variance at {top:.0f} over the expected: {told.variance[-1] / expected:.2f}")
+    assert top > 2 * noise.level[-1]
+    assert 0.5 < told.variance[-1] / expected < 2.0
+    found = detect_markers(film, bits=16)
+    assert not found.dark_markers
+    check(found.images, tips, list(range(len(tips))))
 
 
 @pytest.mark.parametrize("sigma_px", [1.0, 1.3, 1.5])

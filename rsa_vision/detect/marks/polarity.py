@@ -26,6 +26,7 @@ CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the p
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
+_RIVAL = 0.25  # of the evidence of the better polarity, from which the other is looked at as well
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: of marks it has next to none
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
@@ -166,4 +167,5 @@ def polarities(
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and len(seeds.depth) == 0:
         return []
-    return [(sign, optics[sign], looks[sign], noises[sign]) for sign in ((best,) if weight[-best] < 0.25 * weight[best] else (best, -best))]
+    rivals = [sign for sign in signs if sign == best or weight[sign] >= _RIVAL * weight[best]]
+    return [(sign, optics[sign], looks[sign], noises[sign]) for sign in sorted(rivals, key=lambda sign: sign != best)]
