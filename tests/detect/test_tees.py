@@ -89,8 +89,8 @@ def test_blur_comes_from_clean_tees_where_crossing_arms_look_stronger(seed: int)
     gap = np.hypot(*(junctions[:, None, :2] - tips).transpose(2, 0, 1)).min(axis=1)
     junctions[gap > 6.0, 4] *= 100.0
     assert np.count_nonzero(gap > 6.0) > 6
-    optics, known = optics_of_tees(film, first_tees(film, junctions, noise), noise)
-    assert known
+    optics, evidence = optics_of_tees(film, first_tees(film, junctions, noise), noise)
+    assert evidence > 100
     assert 0.8 < optics.sigma_px / np.hypot(SIGMA_PX, np.sqrt(1 / 12)) < 1.25
 
 

@@ -151,18 +151,19 @@ def polarities(
         if pairs is not None:
             optics[sign], balls, found = pairs
             looks[sign] = distinct(join([found, mine]), noises[sign])
-        if balls < max(_LEAST_EVIDENCE, _OF_A_TEE * np.count_nonzero(clear)):
+        if balls < _OF_A_TEE * max(np.count_nonzero(clear), 1):
             tees = first_tees(film, candidates.junctions[clear if clear.any() else strength > 0], noises[sign])
             if noises[sign] is noise:
                 noises[sign] = noise_under_needles(film, tees or slim, GUESS, noise)
-            of_tees, known = optics_of_tees(film, tees, noises[sign])
-            if clear.any() or known:
+            of_tees, evidence = optics_of_tees(film, tees, noises[sign])
+            if clear.any() or evidence > balls:
                 optics[sign] = of_tees
             elif balls < _LEAST_EVIDENCE:
                 more = look_for_pins(film, candidates.strokes, noises[sign])
-                of_pins, balls = optics_of_pins(film, [p for p in pins + more if np.sign(p.depth) == sign], noises[sign])
-                if balls > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
+                of_pins, evidence = optics_of_pins(film, [p for p in pins + more if np.sign(p.depth) == sign], noises[sign])
+                if evidence > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
                     optics[sign] = of_pins
+            balls += evidence
         weight[sign] = balls + _of_tees(candidates, sign)
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and len(seeds.depth) == 0:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
+from rsa_vision.detect.balls.optics import CAP
 from rsa_vision.detect.balls.usual import proportion
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
@@ -131,7 +132,7 @@ def first_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> list[
     return _at_junctions(film, strongest, TAPERS[0], GUESS, noise)[:_ASKED]
 
 
-def optics_of_tees(film: NDArray[Any], cleanest: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, bool]:
+def optics_of_tees(film: NDArray[Any], cleanest: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
     """Estimate the blur from the cleanest tees, for films without balls.
 
     Parameters
@@ -144,8 +145,8 @@ def optics_of_tees(film: NDArray[Any], cleanest: list[NeedleFit], noise: NoiseMo
     Returns
     -------
     optics : Optics
-    known : bool
-        There are tees that tell it; else it is guessed.
+    evidence : float
+        Significance of the tees that tell it; where there are none it is guessed.
     """
     # the very strongest are where arms cross, and of what is no tee the widest blur leaves least
     windows = [window_of(film, [f], replace(GUESS, sigma_px=_BLURS_PX[-1]), noise, None) for f in cleanest]
@@ -155,8 +156,8 @@ def optics_of_tees(film: NDArray[Any], cleanest: list[NeedleFit], noise: NoiseMo
         fits[sigma] = [fit_needles(film, f.position_px, f.angles, f.shape, optics, noise) for f in cleanest]
         left[sigma] = sum(chi2_of(window, f, optics, noise) for window, f in zip(windows, fits[sigma], strict=True))
     best = min(left, key=lambda sigma: left[sigma])
-    known = any(is_tee(f, slack=_BEFORE) for f in fits[best])
-    return replace(GUESS, sigma_px=best if known else COARSE_SIGMA_PX, rough=True), known
+    evidence = float(sum(min(f.significance, CAP) for f in fits[best] if is_tee(f, slack=_BEFORE)))
+    return replace(GUESS, sigma_px=best if evidence > 0 else COARSE_SIGMA_PX, rough=True), evidence
 
 
 def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
@@ -189,9 +190,9 @@ def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseMo
     sizes = sorted(clean, key=lambda f: f.shape.length_px)
     ends = [sizes[0], sizes[-1]] if sizes[-1].shape.length_px > 1.08 * sizes[0].shape.length_px else []
     turned: list[NeedleFit] = []
-    for fit in rough:  # the closest first: one turned by a right angle may explain much of another
-        known = [clean[0], *turned]
-        if is_tee(fit, slack=_BEFORE) and _turned(fit, clean[0]) and _apart([fit], known, _SAME_JUNCTION * fit.shape.length_px):
+    for i, fit in enumerate(rough):  # the closest first: one turned by a right angle may explain much of another
+        closer = [clean[0], *rough[:i]]
+        if is_tee(fit, slack=_BEFORE) and _turned(fit, clean[0]) and _apart([fit], closer, _SAME_JUNCTION * fit.shape.length_px):
             turned.append(fit)
     return [clean[0], *(f for f in ends if f is not clean[0] and all(f is not t for t in turned))], turned
 

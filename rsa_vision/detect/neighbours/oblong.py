@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.balls.alike import SD_OF_MAD
 from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.fits import BallFits, half_size, slopes
 from rsa_vision.detect.film.noise import NoiseModel
@@ -20,6 +21,8 @@ from rsa_vision.detect.neighbours.beside import Beside
 from rsa_vision.types import Bool, Float
 
 _LEAST = 0.08  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make twice that
+_LEAST_OF_LARGER, _SURE_OF_LARGER = 0.02, 7.0  # the same of balls larger than the others of the film: that speaks for two as well
+_LARGER, _OF_SPREAD = 0.05, 3.0  # of the logarithm of the radius; of what radii of the film differ by
 _SURE = 14.0  # chi2 with two degrees of freedom: one image in a thousand, if noise makes that much of an outline at all
 _AMONG_OTHERS = 3.2  # the same where most images are oblong: one in five
 _MEDIAN = 1.386  # of that
@@ -59,11 +62,20 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
     much = told & (length > _MUCH)
     most = np.count_nonzero(much) > len(much) / 2  # where most images are two balls there is no usual one
     told &= chance > _SURE * usual
+    if len(told) >= _LEAST_KNOWN:
+        told |= _larger(balls.radius_px) & (chance > _SURE_OF_LARGER * usual) & (length > _LEAST_OF_LARGER)
     if most or len(told) < _LEAST_KNOWN:
         told |= much
     if most:
         told |= (chance > _AMONG_OTHERS) & (length > _MUCH)
     return np.asarray(told)
+
+
+def _larger(radius_px: Float) -> Bool:
+    """Say which balls are larger than what radii of the film differ by."""
+    size = np.log(radius_px)
+    over = size - np.median(size)
+    return np.asarray(over > max(_LARGER, _OF_SPREAD * SD_OF_MAD * float(np.median(np.abs(over)))))
 
 
 def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
