@@ -94,6 +94,14 @@ def test_blur_comes_from_clean_tees_where_crossing_arms_look_stronger(seed: int)
     assert 0.8 < optics.sigma_px / np.hypot(SIGMA_PX, np.sqrt(1 / 12)) < 1.25
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_arms_of_a_large_tee_that_look_like_a_turned_one_do_not_hide_it(seed: int) -> None:
+    """The widest ring of junctions is half as long as its arms: another junction lies on its bar, and half of the tees became pins."""
+    rng = np.random.default_rng(seed)
+    tips = tips_of(rng)[:4]
+    check(detect_markers(exposed(light_past_tees(tips, np.ones(4), pitch_mm=0.055), rng), bits=16).images, tips, list(range(4)))
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_under_tees_that_no_tile_of_the_film_tells(seed: int) -> None:
     """One over the exposure, as of light through a film: twenty times the variance under tees."""
