@@ -151,7 +151,7 @@ def polarities(
         if pairs is not None:
             optics[sign], balls, found = pairs
             looks[sign] = distinct(join([found, mine]), noises[sign])
-        if balls < _OF_A_TEE * max(np.count_nonzero(clear), 1):
+        if balls < _OF_A_TEE * max(int(clear.sum()), 1):
             tees = first_tees(film, candidates.junctions[clear if clear.any() else strength > 0], noises[sign])
             if noises[sign] is noise:
                 noises[sign] = noise_under_needles(film, tees or slim, GUESS, noise)
@@ -168,5 +168,6 @@ def polarities(
     best = max(signs, key=lambda sign: weight[sign])
     if weight[best] == 0 and len(seeds.depth) == 0:
         return []
-    rivals = [sign for sign in signs if sign == best or weight[sign] >= _RIVAL * weight[best]]
+    least = _RIVAL * weight[best] if weight[best] > _LEAST_EVIDENCE else 0.0
+    rivals = [sign for sign in signs if sign == best or weight[sign] >= least]
     return [(sign, optics[sign], looks[sign], noises[sign]) for sign in sorted(rivals, key=lambda sign: sign != best)]

@@ -25,6 +25,8 @@ BLOCK = 32  # side of the blocks of one pyramid level over which the spread is m
 # (pyramid level, inner sigma, outer sigma in pixels of that level, radius in film pixels that answers best)
 SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
 REACH = 3.0  # blur widths to which kernels go
+LARGEST = 24  # pixels at half resolution: wider areas at an end of the range are none of a mark
+SMOOTH, FROM_FILM = 5, 4.0  # of such pixels: over which a film is averaged before it is carried on into them; where centres may be
 FAINT = 0.86  # of what counts as significant: extrema of so much are listed too, for looks that know what they look for
 ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
 JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for
@@ -110,7 +112,7 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work:
         band = cv2.copyMakeBorder(band, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
     half = cv2.resize(band, (band.shape[1] // 2, band.shape[0] // 2), interpolation=cv2.INTER_AREA)
     image, limit, *others = (row[: half.size].reshape(half.shape) for row in work)
-    image[:] = half
+    image[:], distance = _carried_on(half, noise)
     room = cycle(others)  # three in turn: none is written to from itself
     at, blurred = (1, 0.0), image
     out = [np.zeros((0, 5))]
@@ -137,7 +139,36 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work:
             junctions = find_junctions(significance, place[clear], strength[clear], level)
         if (level, radius) in STROKE_SCALES:
             strokes.append(find_strokes(answer, place[clear], strength[clear], level))
-    return np.concatenate(out), junctions, np.concatenate(strokes)
+    return _on_film(np.concatenate(out), distance), _on_film(junctions, distance), _on_film(np.concatenate(strokes), distance)
+
+
+def _carried_on(image: NDArray[Any], noise: NoiseModel) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """Carry a film on into large areas at an end of the range: margins of scans, shutters. Their edges hide what lies beside them.
+
+    The second is how far pixels are from the film; nothing where there is no such area.
+    """
+    beyond = np.asarray((image <= noise.floor) | (image >= noise.ceiling)).view(np.uint8)
+    if np.count_nonzero(beyond) < LARGEST**2:
+        return image, None
+    # what a square finds room in is larger than the cores of marks; beside it pixels lie half in it
+    area = cv2.dilate(cv2.morphologyEx(beyond, cv2.MORPH_OPEN, np.ones((LARGEST, LARGEST), np.uint8)), np.ones((3, 3), np.uint8))
+    film = area == 0
+    if film.all() or not film.any():
+        return image, None
+    distance, nearest = cv2.distanceTransformWithLabels(area, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    weight = cv2.blur(film.astype(np.float32), (SMOOTH, SMOOTH))
+    smooth = cv2.blur(np.where(film, image, 0).astype(np.float32), (SMOOTH, SMOOTH))
+    values = np.zeros(int(nearest.max()) + 1, np.float32)
+    values[nearest[film]] = smooth[film] / weight[film]
+    return np.where(film, image, values[nearest]), distance
+
+
+def _on_film(table: Float, distance: NDArray[Any] | None) -> Float:
+    """Leave out what lies farther from the film than an image reaches from its centre."""
+    if distance is None:
+        return table
+    col, row = (np.clip(table[:, k] / 2, 0, distance.shape[1 - k] - 1).astype(np.intp) for k in (0, 1))
+    return np.asarray(table[distance[row, col] < FROM_FILM])
 
 
 def _blurred(image: NDArray[Any], by: float, sigma: float, into: NDArray[Any]) -> NDArray[Any]:
