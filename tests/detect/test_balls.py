@@ -184,3 +184,24 @@ def test_a_ball_on_a_film_too_small_for_surroundings_is_measured() -> None:
     film = film_of_balls((50, 50), truth, np.array([3.5]), background=BACKGROUND, depth=DEPTH, noise_sd=300.0, rng=rng)
     _, gap = nearest(truth, detect_markers(stored(film), bits=16))
     assert (gap < 0.5).all()
+
+
+@pytest.mark.parametrize("level", [0, 65535])
+def test_balls_beside_the_margin_of_a_scan_are_found(level: int) -> None:
+    """Seen whole, from one to three radii from a slant border beyond which the scan is black or white: its edge hid most of them."""
+    rng = np.random.default_rng(3)
+    rows = np.arange(25.0, 380.0, 30.0)
+    border = 40 + 0.05 * np.arange(400.0)
+    beside = np.stack([border[rows.astype(int)] + rng.uniform(5.0, 12.0, len(rows)), rows], axis=1)
+    truth = np.vstack([beside, np.argwhere(np.ones((5, 5))) * 55.0 + [130.0, 70.0]])
+    film = stored(film_of_balls((400, 400), truth, np.full(len(truth), 4.0), depth=DEPTH, noise_sd=DEPTH * BACKGROUND / 20, rng=rng))
+    film[np.arange(400)[None, :] < border[:, None]] = level
+    found = detect_markers(film, bits=16)
+    index, gap = nearest(truth, found)
+    print(f"{np.count_nonzero(gap > 1)} of {len(truth)} lost")
+    assert np.count_nonzero(gap > 1) <= 1
+    assert len(found.images) <= len(truth)
+    clear = gap <= 1
+    error = (found.images.position_px[index] - truth)[clear]
+    chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.images.covariance_px2[index][clear]), error)
+    assert chi2.max() < 19.3

@@ -86,14 +86,14 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least
         return float(np.quantile(_ripple(left, trial.variance_at(model), local, fits.radius_px + guess.sigma_px), _QUARTILE))
 
     usual = float(np.quantile(beside, _QUARTILE))
-    if not worth_it(under(noise) / usual, _pixels(fits)):
+    if not worth_it(under(noise), usual, _pixels(fits)):
         return noise
     return carried_to(noise, end + sign * farthest, under, usual)
 
 
-def worth_it(more: float, pixels: float) -> bool:
-    """Say whether what so many pixels leave under marks, in units of what is left beside them, is more than chance, and worth a curve."""
-    return bool(more > 1 + max(_MORE, _BY_CHANCE / np.sqrt(pixels)))
+def worth_it(under: float, usual: float, pixels: float) -> bool:
+    """Say whether what is left of so many pixels under marks is more than the usual, than chance makes it, and worth a curve."""
+    return bool(under > (1 + max(_MORE, _BY_CHANCE / np.sqrt(pixels))) * usual)
 
 
 def carried_to(noise: NoiseModel, value: float, under: Callable[[NoiseModel], float], usual: float) -> NoiseModel:

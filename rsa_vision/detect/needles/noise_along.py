@@ -74,7 +74,7 @@ def noise_under_needles(film: NDArray[Any], fits: list[NeedleFit], optics: Optic
     def under(trial: NoiseModel) -> float:
         return float(np.median([np.mean(a.bent**2 / trial.variance_at(a.level)) / a.beside for a in arms]))
 
-    if not arms or not worth_it(under(noise), sum(len(a.bent) for a in arms)):
+    if not arms or not worth_it(under(noise), 1.0, sum(len(a.bent) for a in arms)):
         return noise
     return carried_to(noise, end + sign * farthest, under, 1.0)
 

@@ -25,7 +25,7 @@ BLOCK = 32  # side of the blocks of one pyramid level over which the spread is m
 # (pyramid level, inner sigma, outer sigma in pixels of that level, radius in film pixels that answers best)
 SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 1.6, 12.0))
 REACH = 3.0  # blur widths to which kernels go
-LARGEST = 24  # pixels at half resolution: wider areas at an end of the range are none of a mark
+LARGEST = 25  # pixels at half resolution: wider areas at an end of the range are none of a mark
 SMOOTH, FROM_FILM = 5, 4.0  # of such pixels: over which a film is averaged before it is carried on into them; where centres may be
 FAINT = 0.86  # of what counts as significant: extrema of so much are listed too, for looks that know what they look for
 ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
@@ -150,10 +150,12 @@ def _carried_on(image: NDArray[Any], noise: NoiseModel) -> tuple[NDArray[Any], N
     beyond = np.asarray((image <= noise.floor) | (image >= noise.ceiling)).view(np.uint8)
     if np.count_nonzero(beyond) < LARGEST**2:
         return image, None
-    # what a square finds room in is larger than the cores of marks; beside it pixels lie half in it
-    area = cv2.dilate(cv2.morphologyEx(beyond, cv2.MORPH_OPEN, np.ones((LARGEST, LARGEST), np.uint8)), np.ones((3, 3), np.uint8))
+    square = np.ones((LARGEST, LARGEST), np.uint8)  # the cores of marks have no room for it; pixels beside what has lie half in it
+    area = cv2.dilate(cv2.morphologyEx(beyond, cv2.MORPH_OPEN, square), np.ones((3, 3), np.uint8))
     film = area == 0
-    if film.all() or not film.any():
+    count, part = cv2.connectedComponents(film.view(np.uint8))
+    # marks on a background that is saturated are islands in it, and no film
+    if film.all() or len(np.unique(part[cv2.erode(film.view(np.uint8), square) > 0])) < count - 1:
         return image, None
     distance, nearest = cv2.distanceTransformWithLabels(area, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     weight = cv2.blur(film.astype(np.float32), (SMOOTH, SMOOTH))
