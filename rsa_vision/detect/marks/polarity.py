@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -132,42 +133,51 @@ def polarities(
     list of tuples
         Sign, optics, first looks and noise (with that at marks of this polarity).
     """
-    weight, optics, looks, noises = {-1: 0.0, 1: 0.0}, {}, {}, {}
-    for sign in signs:
-        # by mottle no blur of pins is told
-        slim = [p for p in pins if is_slim(p) and np.sign(p.depth) == sign]
-        mine = seeds.rows((np.sign(seeds.depth) == sign) & ~faint_beside(seeds, slim, COARSE_SIGMA_PX, noise))
-        strength = -sign * candidates.junctions[:, 4]
-        clear = strength > CLEAR_JUNCTION
-        needles = bool(clear.any() or slim)
-        noises[sign] = noise_at_marks(film, mine, noise, *[BESIDE_NEEDLES] * needles)
-        round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
-        if noises[sign] is not noise:  # not all that was unlike a ball in less noise is none
-            mine = distinct(_look(film, round_ones, pins, noises[sign]), noises[sign])
-            mine = mine.rows(~faint_beside(mine, slim, COARSE_SIGMA_PX, noises[sign]))
-        looks[sign] = mine
-        optics[sign], balls = estimate_optics(film, mine, noises[sign])
-        pairs = None if clear.any() else optics_of_pairs(film, round_ones, mine, optics[sign], noises[sign])
-        if pairs is not None:
-            optics[sign], balls, found = pairs
-            looks[sign] = distinct(join([found, mine]), noises[sign])
-        if balls < _OF_A_TEE * max(int(clear.sum()), 1):
-            tees = first_tees(film, candidates.junctions[clear if clear.any() else strength > 0], noises[sign])
-            if noises[sign] is noise:
-                noises[sign] = noise_under_needles(film, tees or slim, GUESS, noise)
-            of_tees, evidence = optics_of_tees(film, tees, noises[sign])
-            if clear.any() or evidence > balls:
-                optics[sign] = of_tees
-            elif balls < _LEAST_EVIDENCE:
-                more = look_for_pins(film, candidates.strokes, noises[sign])
-                of_pins, evidence = optics_of_pins(film, [p for p in pins + more if np.sign(p.depth) == sign], noises[sign])
-                if evidence > 0 or not len(mine.depth):  # else even one faint ball knows more of its blur than nobody
-                    optics[sign] = of_pins
-            balls += evidence
-        weight[sign] = balls + _of_tees(candidates, sign)
-    best = max(signs, key=lambda sign: weight[sign])
-    if weight[best] == 0 and len(seeds.depth) == 0:
+    seen = {sign: _seen_as(sign, film, seeds, pins, candidates, noise) for sign in signs}
+    best = max(signs, key=lambda sign: seen[sign].weight)
+    if seen[best].weight == 0 and len(seeds.depth) == 0:
         return []
-    least = _RIVAL * weight[best] if weight[best] > _LEAST_EVIDENCE else 0.0
-    rivals = [sign for sign in signs if sign == best or weight[sign] >= least]
-    return [(sign, optics[sign], looks[sign], noises[sign]) for sign in sorted(rivals, key=lambda sign: sign != best)]
+    least = _RIVAL * seen[best].weight if seen[best].weight > _LEAST_EVIDENCE else 0.0
+    rivals = [sign for sign in signs if sign == best or seen[sign].weight >= least]
+    return [(sign, seen[sign].optics, seen[sign].looks, seen[sign].noise) for sign in sorted(rivals, key=lambda sign: sign != best)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """What a film shows if its marks are of one sign of depth, and how much speaks for that."""
+
+    looks: BallFits
+    optics: Optics
+    noise: NoiseModel
+    weight: float
+
+
+def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel) -> _Seen:
+    of_sign = [p for p in pins if np.sign(p.depth) == sign]
+    slim = [p for p in of_sign if is_slim(p)]  # by mottle no blur of pins is told
+    looks = seeds.rows((np.sign(seeds.depth) == sign) & ~faint_beside(seeds, slim, COARSE_SIGMA_PX, noise))
+    junctions = candidates.junctions[-sign * candidates.junctions[:, 4] > 0]
+    clear = junctions[np.abs(junctions[:, 4]) > CLEAR_JUNCTION]
+    round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
+    under = noise_at_marks(film, looks, noise, *[BESIDE_NEEDLES] * bool(len(clear) or slim))
+    if under is not noise:  # not all that was unlike a ball in less noise is none
+        looks = distinct(_look(film, round_ones, pins, under), under)
+        looks = looks.rows(~faint_beside(looks, slim, COARSE_SIGMA_PX, under))
+    optics, balls = estimate_optics(film, looks, under)
+    pairs = None if len(clear) else optics_of_pairs(film, round_ones, looks, optics, under)
+    if pairs is not None:
+        optics, balls, found = pairs
+        looks = distinct(join([found, looks]), under)
+    needles = 0.0
+    if balls < _OF_A_TEE * max(len(clear), 1):
+        tees = first_tees(film, clear if len(clear) else junctions, under)
+        under = noise_under_needles(film, tees or slim, GUESS, noise) if under is noise else under
+        of_tees, needles = optics_of_tees(film, tees, under)
+        if len(clear) or needles > balls:
+            optics = of_tees
+        elif balls < _LEAST_EVIDENCE:
+            more = [p for p in look_for_pins(film, candidates.strokes, under) if np.sign(p.depth) == sign]
+            of_pins, needles = optics_of_pins(film, of_sign + more, under)
+            if needles > 0 or not len(looks.depth):  # else even one faint ball knows more of its blur than nobody
+                optics = of_pins
+    return _Seen(looks, optics, under, balls + needles + _of_tees(candidates, sign))
