@@ -139,7 +139,7 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work:
             junctions = find_junctions(significance, place[clear], strength[clear], level)
         if (level, radius) in STROKE_SCALES:
             strokes.append(find_strokes(answer, place[clear], strength[clear], level))
-    return _on_film(np.concatenate(out), distance), _on_film(junctions, distance), _on_film(np.concatenate(strokes), distance)
+    return _near_film(np.concatenate(out), distance), _near_film(junctions, distance), _near_film(np.concatenate(strokes), distance)
 
 
 def _carried_on(image: NDArray[Any], noise: NoiseModel) -> tuple[NDArray[Any], NDArray[Any] | None]:
@@ -147,6 +147,8 @@ def _carried_on(image: NDArray[Any], noise: NoiseModel) -> tuple[NDArray[Any], N
 
     The second is how far pixels are from the film; nothing where there is no such area.
     """
+    if np.isinf(noise.floor) and np.isinf(noise.ceiling):
+        return image, None
     beyond = np.asarray((image <= noise.floor) | (image >= noise.ceiling)).view(np.uint8)
     if np.count_nonzero(beyond) < LARGEST**2:
         return image, None
@@ -165,7 +167,7 @@ def _carried_on(image: NDArray[Any], noise: NoiseModel) -> tuple[NDArray[Any], N
     return np.where(film, image, values[nearest]), distance
 
 
-def _on_film(table: Float, distance: NDArray[Any] | None) -> Float:
+def _near_film(table: Float, distance: NDArray[Any] | None) -> Float:
     """Leave out what lies farther from the film than an image reaches from its centre."""
     if distance is None:
         return table
