@@ -58,3 +58,27 @@ def test_pairs_that_noise_does_not_let_tell_apart_pass_for_no_single_balls() -> 
         film, truth = film_of_pairs(seed, 3.0, 0.5, 10.0)
         _, square = surely(detect_markers(stored(film), bits=16).images, truth)
         assert max(square, default=0.0) < 25.0
+
+
+@pytest.mark.parametrize(("radius_px", "seed"), [(6.0, 7), (6.0, 8), (6.0, 11), (3.0, 4), (3.0, 11)])
+def test_pairs_that_hardly_lap_and_look_like_no_ball_are_found_where_there_is_nothing_else(radius_px: float, seed: int) -> None:
+    film, truth = film_of_pairs(seed, radius_px, 0.8, 10.0)
+    assert surely(detect_markers(stored(film), bits=16).images, truth)[0] == len(truth)
+
+
+@pytest.mark.parametrize(("radius_px", "apart", "cnr", "seed"), [(6.0, 0.8, 30.0, 5), (6.0, 0.8, 10.0, 2), (9.0, 0.9, 10.0, 2)])
+def test_peaks_along_the_rims_of_a_pair_do_not_hide_it(radius_px: float, apart: float, cnr: float, seed: int) -> None:
+    """The filter answers between two balls and on their rims as well; nine places, at three of which there are two."""
+    rng = np.random.default_rng(1000 * seed + int(10 * radius_px) + int(100 * apart))
+    side = int(40 * radius_px) + 160
+    place = np.array([[i, j] for i in (1, 2, 3) for j in (1, 2, 3)]) * side / 4 + rng.uniform(-3, 3, (9, 2))
+    angle = rng.uniform(0, np.pi, 3)
+    half = apart * radius_px * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    truth = np.concatenate([place[:6], place[6:] - half, place[6:] + half])
+    noise_sd = DEPTH / cnr * BACKGROUND
+    film = film_of_balls(
+        (side, side), truth, np.full(12, radius_px), background=BACKGROUND, depth=DEPTH, sigma_px=1.2, noise_sd=noise_sd, rng=rng
+    )
+    images = detect_markers(stored(film), bits=16).images
+    assert len(images) == len(truth)
+    assert surely(images, truth)[0] == len(truth)

@@ -26,6 +26,7 @@ COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
 _COARSE_BLUR = 0.25  # of the radius that answers, where that is more: between the sharpest and the softest images there are
 MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum ball may leave (film curve, focal spot): see docs/method.md
 DOUBTFUL = 0.6  # of it: more may be two balls, or something else
+ANYTHING = 6.0  # times the misfit that is tolerated otherwise, which pairs leave that hardly lap
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
 PROMISING = 0.85  # of the significance a mark must have: better fits are 3 % more significant mostly, 10 % at the most

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, distinct, first_look, fit_at, misfit, plausible, refine
+from rsa_vision.detect.balls.find import ANYTHING, DOUBTFUL, MISFIT, distinct, first_look, fit_at, misfit, plausible, refine
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.optics import KAPPA, SIGMAS_PX, ball_evidence, unexpected
 from rsa_vision.detect.film.noise import NoiseModel
@@ -23,7 +23,6 @@ _MOST = 100  # seeds among which single balls are looked for
 _STRONGEST = 24  # candidates that are asked where there is no seed
 _FEW = 8  # of the seeds, asked first
 _ASKED, _AT_FIRST = 4, 2  # surest blobs; those asked while the blur is anybody's
-_ANYTHING = 6.0  # times the misfit that is tolerated otherwise, which pairs leave that hardly lap
 _COARSE = 2.0  # the same of pairs at a blur that is nearly right
 _FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
 _WIDE = 1.5  # times the radius of a blob: what is looked at of pairs
@@ -50,11 +49,12 @@ def optics_of_pairs(
     -------
     optics, evidence : Optics, float
         As of :func:`rsa_vision.detect.balls.optics.estimate_optics`; None where there are single balls enough, and where no pairs are.
-    pairs : BallFits
+    looks : BallFits
+        These pairs, and what may be more of them.
     """
     sure = _surest(seeds)
     if len(sure.depth) == 0:
-        sure = _surest(distinct(first_look(film, candidates.rows(slice(_STRONGEST)), noise, slack=_ANYTHING), noise))
+        sure = _surest(distinct(first_look(film, candidates.rows(slice(_STRONGEST)), noise, slack=ANYTHING), noise))
     if len(sure.depth) == 0:
         return None
     for some in (sure.rows(slice(_FEW)), sure):  # mostly a few are enough
@@ -86,7 +86,10 @@ def optics_of_pairs(
     finer = tuple(sigma * step for step in _FINER)
     sigma = refine(finer, [left(as_two(sigma), sigma) for sigma in finer])
     found = [pair for pair, blob in zip(as_two(sigma), blobs, strict=True) if _are_two(pair, blob, noise)]
-    return (Optics(sigma, KAPPA / sigma), ball_evidence(join(found), noise), distinct(join(found), noise)) if found else None
+    if not found:
+        return None
+    others = distinct(first_look(film, candidates, noise, slack=ANYTHING), noise)
+    return Optics(sigma, KAPPA / sigma), ball_evidence(join(found), noise), join([distinct(join(found), noise), others])
 
 
 def _surest(seeds: BallFits) -> BallFits:

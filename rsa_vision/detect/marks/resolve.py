@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls.decide import LEAST_KNOWN, hopeless, look_clear
-from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
+from rsa_vision.detect.balls.find import CHANCE, COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.painted import Painted
@@ -27,6 +27,7 @@ from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
 
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
+_COMPANY, _COARSE = 3, 0.6  # peaks beside one that a group may start from; of the radius, from which they are a ball's own
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
 
@@ -91,6 +92,9 @@ def resolve_balls(
     like = good.rows(clear) if np.count_nonzero(clear) >= LEAST_KNOWN else good
     for members in _unexplained_pairs(film, candidates, good, like, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
+        while len(pair.depth) > 2 and not _like(pair, like).all():  # one peak too many takes part of a ball, and then there is none
+            pair = pair.rows(np.arange(len(pair.depth)) != pair.significance.argmin())
+            pair = fit_group(film, pair.position_px, np.full(len(pair.depth), members[0, 2]), optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     asked = clean & promising(single, limit, optics.sigma_px, noise) & ~hopeless(single, optics.sigma_px, noise)
@@ -125,7 +129,7 @@ def resolve_balls(
     balls = plausible(found, noise)
     alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
     perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
-    found = found.rows(~_bar(found, misfit(found, noise) < DOUBTFUL * MISFIT))
+    found = found.rows(~_bar(found, misfit(found, noise, CHANCE) < DOUBTFUL * MISFIT))
     found = resolve_crowds(film, candidates, distinct(found, noise), optics, noise, tees)
     found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
     found = without_lines(film, distinct(found, noise), limit, optics, noise, tees)
@@ -248,7 +252,8 @@ def _unexplained_pairs(
     peaks = candidates.position_px[fine]
     if len(peaks) == 0:
         return []
-    peaks = peaks[deep_at(film, peaks, typical, tees) > 0.4 * np.median(np.abs(like.depth))]
+    deep = deep_at(film, peaks, typical, tees) > 0.4 * np.median(np.abs(like.depth))
+    fine, peaks = fine[deep], peaks[deep]
     if len(peaks) == 0:
         return []
     gaps = np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1))
@@ -260,9 +265,11 @@ def _unexplained_pairs(
             continue
         gap = np.hypot(*(peaks - peaks[i]).T)
         company = np.nonzero((gap < 2 * typical + TOUCH * optics.sigma_px) & (gap > 0.6 * typical) & free & ~used)[0]
+        if len(company) > _COMPANY:  # fine peaks lie all along the rim of a large ball
+            company = company[candidates.radius_px[fine[company]] > _COARSE * typical]
         company = company[np.argsort(gap[company])][: MOST_IN_GROUP - 1]
         known = good.position_px[np.hypot(*(good.position_px - peaks[i]).T) < 2 * typical + TOUCH * optics.sigma_px]
-        if len(company) + len(known) == 0 or len(company) > 3:
+        if len(company) + len(known) == 0 or len(company) > _COMPANY:
             continue
         starts = np.concatenate([peaks[[i]], peaks[company], known])[:MOST_IN_GROUP]
         used[[i, *company]] = True
