@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.special import chdtri
 
-from rsa_vision.types import Float
+from rsa_vision.detect.film.repairs import repaired_lines
+from rsa_vision.types import Float, Int
 
 TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surface, large enough to hold correlated noise
 ENOUGH_TILES = 12  # that are nowhere saturated
@@ -30,6 +31,8 @@ _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is 
 _ROUNDED = 0.1  # of that: less is left by no noise
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
 
+_NO_LINES = np.zeros(0, np.intp)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseModel:
@@ -43,6 +46,8 @@ class NoiseModel:
         Correlation of pixels at (row, col) offsets -LAGS..LAGS; 1 in the middle.
     floor, ceiling : float
         Values at or beyond them are saturated and carry no information.
+    repaired : tuple of ndarrays of int
+        Columns and rows that were made up from those beside them, as of :func:`rsa_vision.detect.film.repairs.repaired_lines`.
     """
 
     level: Float
@@ -50,6 +55,7 @@ class NoiseModel:
     correlation: Float
     floor: float
     ceiling: float
+    repaired: tuple[Int, Int] = (_NO_LINES, _NO_LINES)
 
     def variance_at(self, values: Float) -> Float:
         """Return the variance of pixels with these expected values (same shape)."""
@@ -189,7 +195,7 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
     variance = np.maximum(curve_array / bias, max(QUANTISATION, least))
-    return NoiseModel(level_array, variance, correlation, floor, ceiling)
+    return NoiseModel(level_array, variance, correlation, floor, ceiling, repaired_lines(film))
 
 
 def _lag_zero() -> Float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,16 @@ def cut(film: NDArray[Any], centres_px: Float, half: int, noise: NoiseModel) -> 
     values = film[np.clip(rows, 0, film.shape[0] - 1)[:, :, None], np.clip(cols, 0, film.shape[1] - 1)[:, None, :]].astype(np.float64)
     valid = inside_r[:, :, None] & inside_c[:, None, :] & (values > noise.floor) & (values < noise.ceiling)
     return Patches(values, valid, corner)
+
+
+def apart_from_repairs(patches: Patches, noise: NoiseModel) -> Patches:
+    """Return the same with lines masked that were made up from those beside them (what is left of a mark is not less whole for that)."""
+    valid = patches.valid
+    for k, lines in enumerate(noise.repaired):
+        if len(lines):
+            seen = ~np.isin(patches.corner_px[:, k, None] + np.arange(patches.size), lines)
+            valid = valid & (seen[:, None, :] if k == 0 else seen[:, :, None])
+    return replace(patches, valid=valid)
 
 
 def columns(blocks: list[Float]) -> Float:

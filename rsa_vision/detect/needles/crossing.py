@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.film.patches import cut, damped_solution, weighted_least_squares
+from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import Images, NeedleFit, NeedleShape, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
@@ -79,7 +79,7 @@ def window_of(
     middle = np.mean([f.position_px for f in needles], axis=0)
     spread = max(float(np.abs(f.position_px - middle).max()) for f in needles)
     half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in needles) + 3 * optics.sigma_px + 3))
-    patch = cut(film, middle[None], half, noise)
+    patch = apart_from_repairs(cut(film, middle[None], half, noise), noise)
     corner = patch.corner_px[0].astype(np.float64)
     axis = np.arange(float(patch.size))
     near = np.zeros((patch.size, patch.size), bool)

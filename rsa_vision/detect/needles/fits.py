@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.find import CHANCE
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import cut, damped_solution
+from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, arm_images, support
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float
@@ -58,7 +58,7 @@ def fit_needles(
     NeedleFit
     """
     half = int(np.ceil(shape.length_px * 1.15 + shape.half_width_px + 3 * optics.sigma_px + 3))
-    patch = cut(film, tip_px[None], half, noise)
+    patch = apart_from_repairs(cut(film, tip_px[None], half, noise), noise)
     corner = patch.corner_px[0].astype(np.float64)
     axis = np.arange(float(patch.size))
     margin = 3 * optics.sigma_px + (1.0 if quick else 4.0)
