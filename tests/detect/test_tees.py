@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
@@ -183,10 +184,10 @@ def test_on_shaded_film_that_is_linear_in_exposure(seed: int) -> None:
 
 def test_what_bone_does_slowly_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     quietest, measured = shared._quietest, {}
+    films = [_tees_on_bone(np.random.default_rng(seed)) for seed in range(3)]
     for name, choose in (("fine", quietest), ("all", lambda film, windows, systems, noise: Filter(noise))):
         monkeypatch.setattr(shared, "_quietest", choose)
-        both = [_tees_on_bone(np.random.default_rng(seed)) for seed in range(3)]
-        error, covariance = (np.concatenate(parts) for parts in zip(*both, strict=True))
+        error, covariance = (np.concatenate(parts) for parts in zip(*(_missed(*film) for film in films), strict=True))
         ratio = np.sqrt(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error).mean() / 2)
         measured[name] = (error**2).mean(), np.median(np.trace(covariance, axis1=1, axis2=2)), ratio
         print(f"{name}: RMS {np.sqrt(measured[name][0]):.4f} px, error / sd {ratio:.2f}")
@@ -195,13 +196,17 @@ def test_what_bone_does_slowly_is_left_out(monkeypatch: pytest.MonkeyPatch) -> N
     assert 0.8 < measured["fine"][2] < 1.2
 
 
-def _tees_on_bone(rng: np.random.Generator) -> tuple[Float, Float]:
-    """Errors of tips and their covariances, on a film of waves as long as the arms of tees and longer."""
+def _tees_on_bone(rng: np.random.Generator) -> tuple[NDArray[np.uint16], Float]:
+    """Return a film of waves as long as the arms of tees and longer, and the tips on it."""
     tips = tips_of(rng)
     waves = [gaussian_filter(rng.standard_normal((SIDE, SIDE)), px) for px in (75, 20)]
     bone = np.exp(0.22 * waves[0] / waves[0].std() + 0.07 * waves[1] / waves[1].std())
     light = gaussian_filter(light_past_tees(tips, np.ones(len(tips)), 0.0625) * bone, SIGMA_PX)
-    film = np.clip(25000 * light * (1 + 0.03 * rng.standard_normal(light.shape)), 0, 65535).astype(np.uint16)
+    return np.clip(25000 * light * (1 + 0.03 * rng.standard_normal(light.shape)), 0, 65535).astype(np.uint16), tips
+
+
+def _missed(film: NDArray[np.uint16], tips: Float) -> tuple[Float, Float]:
+    """Return the errors of tips and their covariances."""
     found = detect_markers(film, bits=16).images
     nearest = np.hypot(*(found.position_px - tips[:, None]).transpose(2, 0, 1)).argmin(axis=1)
     return found.position_px[nearest] - tips, found.covariance_px2[nearest]
