@@ -210,3 +210,19 @@ def _missed(film: NDArray[np.uint16], tips: Float) -> tuple[Float, Float]:
     found = detect_markers(film, bits=16).images
     nearest = np.hypot(*(found.position_px - tips[:, None]).transpose(2, 0, 1)).argmin(axis=1)
     return found.position_px[nearest] - tips, found.covariance_px2[nearest]
+
+
+def test_what_is_blotted_out_beside_tees_does_not_tell_what_bone_does_to_them() -> None:
+    """What lies over tees is blotted out of the film while those under it are fitted: all of a film had no covariance."""
+    rng = np.random.default_rng(8)
+    tips = tips_of(rng)
+    film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
+    noise, optics = estimate_noise(film, 16), Optics(SIGMA_PX, 0.8)
+    candidates = find_candidates(film, STRENGTH, noise)
+    found, _, optics = find_tees(film, candidates.junctions, candidates.strokes, optics, noise)
+    bare = film.astype(np.float64)
+    for col, row in np.rint(tips[::3] + np.array([SIDE / (2 * CELLS), 0])).astype(int):
+        bare[row - 8 : row + 9, col - 8 : col + 9] = np.nan
+    fitted, _ = shared.fit_shared(bare, found, optics, noise, parallel=True)
+    assert len(fitted) == len(tips)
+    assert np.isfinite([f.covariance_px2 for f in fitted]).all()

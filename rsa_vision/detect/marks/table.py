@@ -113,6 +113,9 @@ def table_of(
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
+    unknown = ~np.isfinite(covariance).all(axis=(1, 2))
+    poor |= unknown
+    covariance[unknown] = 0.0
     flags[poor] |= MarkerFlag.POOR_FIT
     # what the model does not describe may be two marks in one: its centre is only somewhere in it
     covariance[poor] += (_SOMEWHERE * radius[poor] ** 2)[:, None, None] * np.eye(2)

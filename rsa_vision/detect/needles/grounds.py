@@ -75,6 +75,8 @@ def errors_by_ground(
         free &= (np.hypot(*(centre[:, None] - middle).transpose(2, 0, 1)) > 0.5 * (span + across)).all(axis=1)
         boxes = [film[row : row + size[1], col : col + size[0]] for col, row in corner[free]]
         values = np.array([box.ravel().take(window.place) for box in boxes], np.float64).reshape(len(boxes), len(window.place))
+        whole = np.isfinite(values).all(axis=1)  # what lies over tees is blotted out while those under it are fitted
+        centre, values = centre[free][whole], values[whole]
         level = values.mean(axis=1, keepdims=True)
         of_pixels = window.filtered(e.inverse[e.tips] @ e.own, through) * np.sqrt(e.weight)  # the filter is its own transpose
         moved = (values - level) @ of_pixels.T
@@ -83,7 +85,7 @@ def errors_by_ground(
         variance = np.einsum("mba,mac,mbc->mb", axes[mine], own, axes[mine])
         louder = noise.variance_at(level) / noise.variance_at(np.array(e.background))
         figures.append((moved**2 / (louder[:, :, None] * variance) / _MEDIAN).reshape(-1, 2))
-        cell = np.repeat((centre[free] // span).astype(np.intp), len(e.members), axis=0)
+        cell = np.repeat((centre // span).astype(np.intp), len(e.members), axis=0)
         near = np.tile(np.arange(len(e.members)), len(values))
         places.append(Places(0, np.arange(first, counts[-1])[: len(e.members)], near, cell, np.zeros((len(near), 0))))
         variances.append(variance)
