@@ -122,6 +122,27 @@ def test_large_balls_cut_off_by_the_end_of_the_values_are_found_and_flagged(radi
     assert 0.6 < ratio < 1.35  # 32 coordinates
 
 
+@pytest.mark.parametrize(("radius_px", "part"), [(4.0, 0.4), (4.0, 0.7), (8.0, 0.4)])
+@pytest.mark.parametrize("bright", [False, True])
+def test_sharp_balls_of_which_only_the_rim_is_left_are_found_and_flagged(radius_px: float, part: float, bright: bool) -> None:
+    """Windowed exports: tantalum is black all over. Nine of ten were lost; ``part`` of their depth is cut off."""
+    rng = np.random.default_rng(5)
+    truth, radius = grid_of_balls(rng, 4, 14 * radius_px, (0.97 * radius_px, 1.03 * radius_px))
+    side = round(60 * radius_px)
+    film = film_of_balls((side, side), truth, radius, depth=0.9, sigma_px=0.9, noise_sd=500.0, rng=rng)
+    film = np.maximum(film - BACKGROUND * (0.1 + 0.9 * part), 0.0)
+    found = detect_markers(65535 - stored(film) if bright else stored(film), bits=16)
+    assert found.dark_markers != bright
+    assert len(found.images) == len(truth)
+    index, gap = nearest(truth, found)
+    assert gap.max() < 0.5
+    assert (found.images.flags[index] & MarkerFlag.CLIPPED).all()
+    error = found.images.position_px[index] - truth
+    ratio = float(np.sqrt((error**2 / np.einsum("nii->ni", found.images.covariance_px2[index])).mean()))
+    print(f"radius {radius_px}, cut off {part}: error / sd {ratio:.2f}")
+    assert 0.6 < ratio < 1.35
+
+
 @pytest.mark.parametrize("noise_blur_px", [0.0, 0.6])
 @pytest.mark.parametrize("radius_px", [8.0])
 def test_large_balls_with_much_more_noise_than_beside_them_are_found(radius_px: float, noise_blur_px: float) -> None:

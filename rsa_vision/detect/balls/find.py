@@ -111,8 +111,8 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     -------
     ndarray of bool, shape (n,)
     """
-    # little is left of the window beside a saturated area: enough if the ball itself is whole
-    seen = ((fits.valid_fraction > 0.3) & (fits.window_fraction > 0.5)) | ((fits.valid_fraction > 0.6) & (fits.window_fraction > 0.05))
+    # little is left of the window beside a saturated area: enough if the ball itself is whole; of a ball that is cut off, its rim
+    seen = ((fits.valid_fraction > 0.1) & (fits.window_fraction > 0.5)) | ((fits.valid_fraction > 0.6) & (fits.window_fraction > 0.05))
     usable = seen & np.isfinite(fits.position_px).all(1)
     # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
     least = 1 - (1 - EXPLAINED) * slack

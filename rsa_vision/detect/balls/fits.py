@@ -21,6 +21,8 @@ _FADED = 4.0  # blur widths beyond the rim where nothing is left of a ball's ima
 _SPARSE_PX = 14  # pixels either way that a first look needs of a window
 _CONVERGED_PX = 2e-4
 _NEAR_PX = 5e-3  # enough for a first look
+_CUT_OFF = 0.5  # of the pixels inside a ball, from which its depth is told by what can be
+_DEEPER, _DEEPER_SD = 1.4, 0.5  # depth of such a ball, and its error, of what the range has room for
 _MAX_STEP_PX = 0.7
 
 
@@ -173,6 +175,8 @@ def fit_balls(
     depth = np.zeros(n)
     converged = np.zeros(n, bool)
 
+    known, expected = _depths_cut_off(values.take(pixels.place, axis=1), valid > 0, pixels.distance < radius[:, None], noise)
+
     def images(of: Any) -> Float:
         far = np.hypot(*(local[of] - half).T) + radius[of] + _FADED * sigma_px
         reached = int(np.searchsorted(pixels.distance, far.max()))
@@ -189,6 +193,8 @@ def fit_balls(
             model = equations.model(seen, depth) + beside
             equations = weighted(pixels, data, valid / noise.variance_at(model).astype(np.float32))
         normal, right, _ = equations.normal(seen, busy, damping=1e-6)
+        normal[:, 3, 3] += known[busy]
+        right[:, 3] += (known * expected)[busy]
         if step == 0:  # depth and background at the starting centre first: Gauss-Newton on the centre needs a depth
             depth = right[:, 3] / normal[:, 3, 3]
         by = _by_depth(depth[busy])
@@ -205,6 +211,8 @@ def fit_balls(
                 break
     seen = images(slice(None))
     normal, right, taken = equations.normal(seen, slice(None))
+    normal[:, 3, 3] += known
+    right[:, 3] += known * expected
     depth = right[:, 3] / normal[:, 3, 3]
     weight, reached = equations.weight, seen.shape[2]
     residual = data - equations.model(seen, depth)
@@ -253,6 +261,22 @@ def fit_balls(
         n_core=core_n,
         converged=converged,
     )
+
+
+def _depths_cut_off(values: Float, valid: Bool, inside: Bool, noise: NoiseModel) -> tuple[Float, Float]:
+    """One over the variance of the depths of balls whose middle is cut off by an end of the range, and what they may be; (n,) each.
+
+    Rims tell how steep an image is; how deep, and with it the radius, they hardly do.
+    """
+    known, expected = np.zeros((2, len(values)))
+    if np.isinf(noise.floor) and np.isinf(noise.ceiling):
+        return known, expected
+    for end, beyond in ((noise.floor, values <= noise.floor), (noise.ceiling, values >= noise.ceiling)):
+        cut = (beyond & inside).sum(axis=1) > _CUT_OFF * inside.sum(axis=1)
+        for k in np.flatnonzero(cut & valid.any(axis=1)):
+            room = end - float(np.median(values[k, valid[k]]))
+            expected[k], known[k] = _DEEPER * room, (_DEEPER_SD * room) ** -2.0
+    return known, expected
 
 
 def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) -> Float:
