@@ -41,6 +41,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 
 __all__ = ["Detection", "detect_markers"]
 
+_BEYOND = 4.0  # times what first looks show of the other polarity: marks that are found leave it no chance
 BENT = 1.5  # of what a ball may leave, once an edge or bending surfaces around it could have taken it up
 
 
@@ -98,8 +99,10 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
     arms = at_junctions(strokes, candidates.junctions)
     pins, candidates = look_for_pins(values, strokes[~arms], noise), replace(candidates, strokes=strokes[arms])
     seeds, signs = first_looks(values, candidates, pins, noise)
-    found = []
-    for sign, optics, mine, of_marks in polarities(values, signs, seeds, pins, candidates, noise):
+    found: list[tuple[float, Detection]] = []
+    for sign, optics, mine, of_marks, weight in polarities(values, signs, seeds, pins, candidates, noise):
+        if found and found[0][0] > _BEYOND * weight:
+            break
         bright = high_balls(mine, of_marks)
         if len(bright.depth) and not as_it_is:
             other, its_noise = log_odds(values, bits, noise)

@@ -14,17 +14,23 @@ SIDE, CELLS, LENGTH_PX = 600, 4, 20
 ARMS = np.deg2rad([97.0, 187.0, 7.0])  # stem first; counter-clockwise as displayed
 
 
-def light_past_tees(tips: Float, deep: Float, pitch_mm: float = PITCH_MM, turned: Float | None = None) -> Float:
-    """Light that comes past tees of 0.5 x 2 mm, exact chords; ``deep``: the part of what they absorb that a film shows."""
-    turned = np.zeros(len(tips)) if turned is None else turned
+def light_past_tees(
+    tips: Float, deep: Float, pitch_mm: float = PITCH_MM, turned: Float | None = None, longer: Float | None = None
+) -> Float:
+    """Light that comes past tees of 0.5 x 2 mm, exact chords; ``deep``: the part of what they absorb that a film shows.
+
+    ``turned``: each tee, or each arm, by radians; ``longer``: each arm, so many times.
+    """
+    turned = np.zeros((len(tips), 1)) if turned is None else turned.reshape(len(tips), -1)
+    turned, longer = np.broadcast_to(turned, (len(tips), 3)), np.ones((len(tips), 3)) if longer is None else longer
     clear, half = np.ones((SIDE, SIDE)), int(3.4 / pitch_mm)
-    for tip, part, turn in zip(tips, deep, turned, strict=True):
+    for tip, part, turns, times in zip(tips, deep, turned, longer, strict=True):
         corner = tip.astype(int) - half
         line = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5
         x, y = np.meshgrid(line + corner[0] - tip[0], line + corner[1] - tip[1])
         origin, down = np.array([x * pitch_mm, y * pitch_mm, 0 * x]), np.array([0 * x, 0 * x, 0 * x + 1])
-        ways = [np.array([np.cos(a + turn), -np.sin(a + turn), 0.0]) for a in ARMS]
-        chord = sum(chord_pin(origin, down, np.zeros(3), way, 2.0, 0.25) for way in ways)
+        ways = [np.array([np.cos(a), -np.sin(a), 0.0]) for a in ARMS + turns]
+        chord = sum(chord_pin(origin, down, np.zeros(3), way, 2.0 * more, 0.25) for way, more in zip(ways, times, strict=True))
         light = np.exp(-MU_PER_MM * chord).reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
         clear[corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= 1 - part * (1 - light)
     return clear

@@ -115,7 +115,7 @@ def _of_arms(strokes: Float, sign: int) -> float:
 
 def polarities(
     film: NDArray[Any], signs: list[int], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
-) -> list[tuple[int, Optics, BallFits, NoiseModel]]:
+) -> list[tuple[int, Optics, BallFits, NoiseModel, float]]:
     """Choose the signs of depth worth looking at: both only where neither is clearly the markers'.
 
     Parameters
@@ -131,7 +131,7 @@ def polarities(
     Returns
     -------
     list of tuples
-        Sign, optics, first looks and noise (with that at marks of this polarity).
+        Sign, optics, first looks, noise (with that at marks of this polarity) and the evidence for it; most evidence first.
     """
     seen = {sign: _seen_as(sign, film, seeds, pins, candidates, noise) for sign in signs}
     best = max(signs, key=lambda sign: seen[sign].weight)
@@ -139,7 +139,10 @@ def polarities(
         return []
     least = _RIVAL * seen[best].weight if seen[best].weight > _LEAST_EVIDENCE else 0.0
     rivals = [sign for sign in signs if sign == best or seen[sign].weight >= least]
-    return [(sign, seen[sign].optics, seen[sign].looks, seen[sign].noise) for sign in sorted(rivals, key=lambda sign: sign != best)]
+    return [
+        (sign, seen[sign].optics, seen[sign].looks, seen[sign].noise, seen[sign].weight)
+        for sign in sorted(rivals, key=lambda sign: sign != best)
+    ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,11 +40,14 @@ class NeedleShape:
         At the thick end; from the tip to the thick end.
     taper : float
         Part of the length over which it tapers (1: a full cone).
+    arms : tuple of float
+        Lengths of the arms of a tee in units of that, if not one for all.
     """
 
     half_width_px: float
     length_px: float
     taper: float = 1.0
+    arms: tuple[float, ...] = (1.0,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,11 +261,13 @@ def arm_images(
         return seen.spread([value])
     more_w, more_l, *more, g_s, g_p = more
     cell = _cell(seen.key[3].sigma_px)
-    along, across = (seen.at_s + seen.first[0] / cell) * seen.cell_s, (seen.at_p + seen.first[1] / cell) * seen.cell_p
+    cell_s = seen.cell_s * seen.of_arms(shape.arms)
+    along, across = (seen.at_s + seen.first[0] / cell) * cell_s, (seen.at_p + seen.first[1] / cell) * seen.cell_p
     c, s = np.cos(angles)[seen.arm], -np.sin(angles)[seen.arm]
-    g_s, g_p = g_s * (cell / seen.cell_s), g_p * (cell / seen.cell_p)
+    g_s, g_p = g_s * (cell / cell_s), g_p * (cell / seen.cell_p)
     d_angle = g_p * along - g_s * across  # counter-clockwise as displayed, the row axis pointing down
-    by_size = [more_w - g_p * across / shape.half_width_px, more_l - g_s * along / shape.length_px]
+    stretch = seen.of_arms(shape.arms)
+    by_size = [more_w - g_p * across / shape.half_width_px, more_l * stretch - g_s * along / shape.length_px]
     return seen.spread([value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more])
 
 
@@ -281,7 +286,7 @@ class _Seen:
 
     key: _Key
     first: tuple[float, float]
-    cell_s: float  # stretched
+    cell_s: float  # stretched, for an arm of the common length
     cell_p: float
     arm: Int
     at_s: Float
@@ -296,7 +301,8 @@ class _Seen:
         cell = _cell(key[3].sigma_px)
         cell_s, cell_p = cell * shape.length_px / key[1], cell * shape.half_width_px / key[0]
         c, s = np.cos(angles)[:, None], -np.sin(angles)[:, None]
-        at_s = dx * (c / cell_s) + (dy * (s / cell_s) - first[0] / cell)
+        of_s = cell_s * np.array(shape.arms)[:, None]
+        at_s = dx * (c / of_s) + (dy * (s / of_s) - first[0] / cell)
         at_p = dy * (c / cell_p) - (dx * (s / cell_p) + first[1] / cell)
         within = (np.abs(at_s - middle[0]) < reach[0]) & (np.abs(at_p - middle[1]) < reach[1])
         index = np.flatnonzero(within)
@@ -317,8 +323,12 @@ class _Seen:
             found = [_look_up(table, self.at_s[i:end], self.at_p[i:end]) for table, (i, end) in zip(tables, parts, strict=True)]
             value, *more = np.concatenate(found, axis=1)
             value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
-        value += (shape.half_width_px - self.key[0]) * more[0] + (shape.length_px - self.key[1]) * more[1]
+        value += (shape.half_width_px - self.key[0]) * more[0] + (shape.length_px * self.of_arms(shape.arms) - self.key[1]) * more[1]
         return value, more
+
+    def of_arms(self, arms: tuple[float, ...]) -> Float | float:
+        """Return at each pixel the number of its arm."""
+        return arms[0] if len(arms) == 1 else np.array(arms)[self.arm]
 
     def spread(self, rows: Sequence[Float] | Float) -> Float:
         """Put rows of what is seen to arms and pixels, zero elsewhere."""

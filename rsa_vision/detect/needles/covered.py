@@ -122,7 +122,8 @@ def _arms(model: NeedleFit, optics: Optics) -> list[tuple[NDArray[np.float32], s
     coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, SCALE / np.sqrt(12))))
     arms = []
     for k in range(len(model.angles)):
-        one = replace(model, angles=model.angles[[k]], depths=model.depths[[k]], slants=None)
+        shape = replace(model.shape, arms=model.shape.arms[k : k + 1] or model.shape.arms)
+        one = replace(model, shape=shape, angles=model.angles[[k]], depths=model.depths[[k]], slants=None)
         arm = needle_image(cols_of, rows_of, one, coarse).astype(np.float32)
         under = np.abs(arm) > _FADED * np.abs(arm).max()
         rows, cols = (slice(max(int(at[0]) - _RIM, 0), int(at[-1]) + _RIM + 1) for at in (np.flatnonzero(under.any(a)) for a in (1, 0)))

@@ -13,7 +13,7 @@ from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.whitening import Filter
-from rsa_vision.detect.models.needles import Images, NeedleFit, NeedleShape, arm_images, needle_image, support
+from rsa_vision.detect.models.needles import Images, NeedleFit, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import PROMISING, between, explains, scored, step_of
 from rsa_vision.types import Float, Int
@@ -228,5 +228,5 @@ def moved(needles: Sequence[NeedleFit], by: Float, half: int) -> list[NeedleFit]
 def _moved(fit: NeedleFit, delta: Float, half: int) -> NeedleFit:
     wider, longer = between(delta[2], -0.5, 0.5), between(delta[3], -2.0, 2.0)
     width = between(fit.shape.half_width_px + wider, 0.6, 0.3 * fit.shape.length_px)
-    shape = NeedleShape(width, between(fit.shape.length_px + longer, 3.0, half / 1.05), fit.shape.taper)
+    shape = replace(fit.shape, half_width_px=width, length_px=between(fit.shape.length_px + longer, 3.0, half / 1.05))
     return replace(fit, position_px=fit.position_px + delta[:2], shape=shape, angles=fit.angles + delta[-1])

@@ -13,6 +13,7 @@ from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit, arm_images, arms_by_optics
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window, gain_at, lapping
+from rsa_vision.detect.needles.irregular import ARMS, OF_STRETCH, WAYS, Regularity, ways_of
 from rsa_vision.types import Float, Int
 
 OPTICS, SHARED = 6, 8  # common to all: attenuation, blur, taper, curve (2), tail; then logarithms of half width and length; then directions
@@ -117,6 +118,16 @@ class Equations:
         covariance = self.inverse[at[:, :, None], at[:, None]] + error_px**2 * np.eye(2)
         return np.asarray(np.einsum("mi,mi->m", change[at], np.linalg.solve(covariance, change[at][:, :, None])[:, :, 0]) / 2)
 
+    def free_ways(self, common: Float) -> tuple[Float, Float]:
+        """How far the arms of each tee differ were nothing expected of that, and the squares of the errors, shape (members, 4)."""
+        each = own_parameters(ARMS, self.parallel)
+        at = np.add.outer(each * np.arange(len(self.members)), np.arange(each - WAYS, each)).ravel()
+        prior = self.prior.copy()
+        prior[at] = 0.0
+        free = replace(self, prior=prior, known=np.where(prior > 0, self.known, 0.0))
+        ways = np.concatenate([ways_of(f, common) for f in self.members]) + free.own_alone[at]
+        return ways.reshape(-1, WAYS), self.excess * free.inverse.diagonal()[at].reshape(-1, WAYS)
+
     @cached_property
     def cost(self) -> float:
         """Minus twice the logarithm of likelihood and prior, but for a constant, were the variance unknown: bone is no noise."""
@@ -137,6 +148,8 @@ def linearise(
     parallel: bool,
     typical: Float,
     spread: Float,
+    regularity: Regularity | None,
+    differs: Float,
     before: Equations | None,
 ) -> Equations:
     """Linearise the fit of the needles of a window where they are.
@@ -155,6 +168,10 @@ def linearise(
         Logarithms of half width and length that are usual on the film.
     spread : ndarray of shape (members, 2)
         How far each may differ from them (standard deviations); infinite where nothing is known.
+    regularity : Regularity, optional
+        Of the arms of tees.
+    differs : ndarray of shape (members, 4)
+        Of that, the spread of these.
     before : Equations, optional
         Those of the step before: noise and gain go with their background and depths.
 
@@ -184,7 +201,7 @@ def linearise(
     left = window.data - model
     now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
     moves, common, priors, known = [], np.zeros((SHARED + (arms - 1) * parallel, len(weight))), [], []
-    for f, block, slope, differs in zip(now, blocks, slopes, spread, strict=True):
+    for f, block, slope, of_size, of_ways in zip(now, blocks, slopes, spread, differs, strict=True):
         size = np.array([f.shape.half_width_px, f.shape.length_px])
         by_tip_and_size = f.depths @ block[1:5]
         turns = f.depths[:, None] * block[5]
@@ -196,13 +213,18 @@ def linearise(
         if parallel:
             common[SHARED:] += turns[1:]
         turning = np.zeros(1 if parallel else arms)
-        priors += [np.zeros(2), 1 / (differs * size), turning, 1 / expected]
+        priors += [np.zeros(2), 1 / (of_size * size), turning, 1 / expected]
         known += [
             np.zeros(2),
-            (typical - np.log(size)) / differs,
+            (typical - np.log(size)) / of_size,
             turning,
             -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected,
         ]
+        if regularity is not None:
+            ways = slice(0 if parallel else 2, None)
+            moves += [turns[1:]] * parallel + [OF_STRETCH.T @ (size[1] * f.depths[:, None] * block[4])]
+            priors.append(1 / of_ways[ways])
+            known.append((regularity.typical - ways_of(f, regularity.common))[ways] / of_ways[ways])
     rows = np.concatenate([*moves, linear, common]) * root
     p, rest = len(rows) - len(common), np.zeros(len(linear))
     return Equations(
@@ -224,8 +246,8 @@ def linearise(
 
 
 def own_parameters(arms: int, parallel: bool) -> int:
-    """Count tip (2), half width, length, one or all directions and what the ends have; the depths are linear."""
-    return 4 + (1 if parallel else arms) + int(OF_SLANTS[arms].shape[1])
+    """Count tip (2), half width, length, one or all directions, what the ends have, how arms differ; the depths are linear."""
+    return 4 + (1 if parallel else arms) + int(OF_SLANTS[arms].shape[1]) + (0 if arms == 1 else WAYS if parallel else WAYS - 2)
 
 
 def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:

@@ -89,7 +89,7 @@ def fit_needles(
         tip += scale * delta[:2]
         width = between(shape.half_width_px + between(scale * delta[2], -0.5, 0.5), 0.6, 0.3 * shape.length_px)
         longer = between(scale * delta[3], -2.0, 2.0)
-        shape = NeedleShape(width, between(shape.length_px + longer, 3.0, half / 1.05), shape.taper)
+        shape = replace(shape, half_width_px=width, length_px=between(shape.length_px + longer, 3.0, half / 1.05))
         angles += scale * delta[4]
         converged = step > 0 and bool(np.abs(delta[:2]).max() < close)
         if np.hypot(*(tip - tip_px)) > 0.6 * half:

@@ -21,9 +21,10 @@ from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window, window_of
-from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, SHARED, SLANT, Equations, by_optics, linearise
+from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, SHARED, SLANT, Equations, by_optics, linearise, own_parameters
 from rsa_vision.detect.needles.fits import between, scored
 from rsa_vision.detect.needles.grounds import errors_by_ground
+from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms, regular, told_by
 from rsa_vision.detect.needles.sets import beside_each, clusters
 from rsa_vision.types import Float
 
@@ -35,6 +36,7 @@ _FINEST_PX = 0.02  # added to those, for the tables are interpolated
 _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
 _TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
 _SIZE_ERROR = 1.0  # of those, before
+_ASKED_AFTER = 4  # steps, after which it is asked at the latest how far arms differ: what differs does not converge
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
@@ -94,8 +96,12 @@ def fit_shared(
     errors = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, _SIZE_ERROR, _SIZE_ERROR]
     precision = np.diag(np.array(errors + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     # steps weigh pixels as if noise were white, and believe them the more the more neighbours share of it
-    held = precision * float(noise.gain(np.hypot(optics.sigma_px, np.median([f.shape.half_width_px for f in needles]))))
-    at = _State(sets, np.zeros(len(precision)), needles[0].shape.taper, _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets]))
+    gain = float(noise.gain(np.hypot(optics.sigma_px, np.median([f.shape.half_width_px for f in needles]))))
+    held = precision * gain
+    sizes = _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
+    arms = regular(sets) if len(needles[0].angles) == ARMS else None
+    at = _State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, arms)
+    asked = not parallel
     start, slopes, since = optics, list[list[Float]](), np.full(OPTICS, np.inf)
     last: list[Equations | None] = [None] * len(sets)
     before: tuple[_State, list[Equations], _Step] | None = None
@@ -105,8 +111,8 @@ def fit_shared(
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any():
             slopes, since = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)], at.moved[:OPTICS]
         systems = [
-            linearise(w, m, k, optics, noise, parallel, at.sizes.typical, spread, e)
-            for w, m, k, spread, e in zip(windows, at.sets, slopes, at.sizes.spread, last, strict=True)
+            linearise(w, m, k, optics, noise, parallel, at.sizes.typical, spread, at.regularity, differs, e)
+            for w, m, k, spread, differs, e in zip(windows, at.sets, slopes, at.sizes.spread, at.differs, last, strict=True)
         ]
         last = [*systems]
         cost = sum(e.cost for e in systems) + float(at.moved @ held @ at.moved)
@@ -127,6 +133,11 @@ def fit_shared(
             surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, step.own, strict=True)])
             converged = count > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
             converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
+            if (converged or count >= _ASKED_AFTER) and not asked:  # near enough to tell how far their arms differ
+                asked = True
+                if odd := _odd(systems, at, gain):
+                    at, converged, least, before = replace(at, regularity=odd), False, np.inf, None
+                    continue
             if converged and not alike:
                 break  # from so near the last step gets there as well; that to the sizes of all is longer
         before = at, systems, step
@@ -200,12 +211,21 @@ class _State:
     moved: Float
     taper: float
     sizes: _Sizes
+    regularity: Regularity | None
+
+    @property
+    def differs(self) -> list[Float]:
+        """How far the arms of each tee may differ, by sets (m, 4)."""
+        return [np.zeros((len(m), WAYS)) for m in self.sets] if self.regularity is None else self.regularity.spread
 
     def after(self, step: _Step, systems: list[Equations], parallel: bool) -> _State:
         taper = self.taper + float(step.change[2])
         sets = [_moved(e.members, own, step.change, taper, parallel) for e, own in zip(systems, step.own, strict=True)]
         sizes = replace(self.sizes, typical=self.sizes.typical + step.change[OPTICS:SHARED])
-        return _State(sets, self.moved + step.change, taper, sizes)
+        known = self.regularity
+        if known is not None and parallel:
+            known = replace(known, common=known.common + step.change[SHARED:])
+        return _State(sets, self.moved + step.change, taper, sizes, known)
 
 
 def _sizes(systems: list[Equations], sets: list[list[NeedleFit]]) -> _Sizes:
@@ -216,6 +236,14 @@ def _sizes(systems: list[Equations], sets: list[list[NeedleFit]]) -> _Sizes:
     told = [true_spread(values[:, k], variance[:, k]) for k in range(2)]
     spread = np.stack([np.where(belongs, sd, np.inf) for _, sd, belongs in told], axis=1)
     return _Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
+
+
+def _odd(systems: list[Equations], at: _State, gain: float) -> Regularity | None:
+    """How far arms differ, where they do; ``gain``: of the variances, by noise that neighbours share."""
+    if at.regularity is None:
+        return None
+    ways, variances = zip(*(e.free_ways(at.regularity.common) for e in systems), strict=True)
+    return told_by(list(ways), [gain * v for v in variances], at.regularity)
 
 
 def _moved_optics(start: Optics, by: Float) -> Optics:
@@ -232,7 +260,7 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
     arms = len(members[0].angles)
     wider, longer, turns = *change[OPTICS:SHARED], change[SHARED:]
     turning = 1 if parallel else arms
-    each = 4 + turning + OF_SLANTS[arms].shape[1]
+    each, ends = own_parameters(arms, parallel), 4 + turning + OF_SLANTS[arms].shape[1]
     parts = delta[: each * len(members)].reshape(len(members), each)
     shift, turn = float(np.abs(parts[:, :2]).max()), float(np.abs(parts[:, 4 : 4 + turning]).max())
     scale = min(1.0, 1.0 / max(shift, 1e-9), 0.1 / max(turn, 1e-9))
@@ -240,9 +268,12 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
     for f, part in zip(members, scale * parts, strict=True):
         width, length = f.shape.half_width_px, f.shape.length_px
         width = between(width + between(part[2] + width * wider, -0.5, 0.5), 0.6, 0.3 * length)
-        shape = NeedleShape(width, max(length + between(part[3] + length * longer, -2.0, 2.0), 3.0), taper)
-        angles = f.angles + part[4 : 4 + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
-        slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[4 + turning :]).reshape(2, arms)
+        ways = np.append(np.zeros(WAYS - each + ends), part[ends:])  # no leans where each arm has a direction of its own
+        angles, lengths = moved_arms(f, ways) if arms == ARMS else (f.angles, f.shape.arms)
+        length = max(length + between(part[3] + length * longer, -2.0, 2.0), 3.0)
+        shape = NeedleShape(width, length, taper, lengths)
+        angles = angles + part[4 : 4 + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
+        slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[4 + turning : ends]).reshape(2, arms)
         slants = np.clip(slants, [[-SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
         out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants))
     return out

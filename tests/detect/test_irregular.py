@@ -1,0 +1,67 @@
+"""Tees whose arms are not square, or of lengths of their own, are where they are said to be; regular ones are still taken as alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rsa_vision.detect import detect_markers
+from rsa_vision.detect.needles.irregular import OF_STRETCH, Regularity, told_by
+from rsa_vision.types import Float
+
+from .test_covered import CELLS, exposed, light_past_tees, tips_of
+
+COUNT = CELLS**2
+
+
+def errors(film: NDArray[np.uint16], tips: Float) -> tuple[Float, Float]:
+    """Return the errors of tips in pixels (n, 2) and in standard deviations (n,)."""
+    found = detect_markers(film, bits=16).images
+    assert found.shape.tolist() == ["tee"] * COUNT
+    assert not found.flags.any()
+    nearest = np.hypot(*(found.position_px - tips[:, None]).transpose(2, 0, 1)).argmin(axis=1)
+    error = found.position_px[nearest] - tips
+    return error, np.sqrt(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[nearest]), error))
+
+
+@pytest.mark.parametrize("kind", ["leaning by 2 degrees", "a tenth shorter", "tilted by 25 degrees"])
+def test_arms_that_differ_move_no_tip_silently(kind: str) -> None:
+    """Up to fifteen stated errors off with no flag, all being taken as alike."""
+    z = []
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        tips, turned, longer = tips_of(rng), np.zeros((COUNT, 3)), np.ones((COUNT, 3))
+        if kind.startswith("leaning"):
+            turned = np.deg2rad(rng.uniform(-2, 2, (COUNT, 3)))
+        elif kind.startswith("a tenth"):
+            longer = 1 - rng.uniform(0, 0.1, (COUNT, 3))
+        else:
+            longer = np.tile([1.0, np.cos(np.deg2rad(25)), np.cos(np.deg2rad(25))], (COUNT, 1))
+        error, of_sd = errors(exposed(light_past_tees(tips, np.ones(COUNT), turned=turned, longer=longer), rng), tips)
+        z.append(of_sd)
+        print(
+            f"{kind}: RMS {np.sqrt(np.mean(error**2)):.3f} px, error / sd {np.sqrt(np.mean(of_sd**2) / 2):.2f}, largest {of_sd.max():.1f}"
+        )
+    assert np.sqrt(np.mean(np.square(z)) / 2) < 1.35
+    assert np.max(z) < 4.5
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.02])
+def test_only_what_is_more_than_chance_is_a_difference(spread: float) -> None:
+    known = Regularity(np.array([1.57, -1.57]), np.zeros(4), [np.full((1, 4), 1e-4)] * 20)
+    told = 0
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        ways = [rng.normal(0, np.hypot(spread, 0.01), (1, 4)) for _ in range(20)]
+        regularity = told_by(ways, [np.full((1, 4), 1e-4)] * 20, known)
+        if regularity is not None:
+            told += 1
+            if spread:
+                assert 0.4 * spread < np.median(np.concatenate(regularity.spread)) < 2 * spread
+    assert (told < 3) if spread == 0 else (told == 50)
+
+
+def test_ways_in_which_lengths_differ_leave_the_mean_of_the_logarithms() -> None:
+    assert np.allclose(OF_STRETCH.sum(axis=0), 0)
+    assert abs(OF_STRETCH[:, 0] @ OF_STRETCH[:, 1]) < 1e-12
