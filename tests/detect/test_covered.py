@@ -85,6 +85,21 @@ def test_beside_a_letter(place: str) -> None:
     check(found.rows(found.shape == "tee"), tips, [5])
 
 
+def test_an_arm_of_which_the_rest_is_hidden_is_no_pin_without_a_flag() -> None:
+    rng = np.random.default_rng(12)
+    tips = tips_of(rng)
+    clear = light_past_tees(tips, np.ones(len(tips)))
+    hidden = [5, 10]
+    for col, row in np.rint(tips[hidden]).astype(int):
+        clear[row - 4 : row + 40, col - 50 : col + 50] *= 0.03
+    found = detect_markers(exposed(clear, rng), bits=16).images
+    pins = found.rows(found.shape == "pin")
+    near = np.hypot(*(pins.position_px[:, None] - tips[hidden]).transpose(2, 0, 1)).min(axis=1) < LENGTH_PX
+    assert near.any()
+    assert (pins.flags[near] & MarkerFlag.UNLIKE).all()
+    assert np.count_nonzero((found.shape == "tee") & (found.flags == 0)) == len(tips) - len(hidden)
+
+
 @pytest.mark.parametrize("faint", [0.15, 0.4])
 def test_a_faint_one_that_a_clear_one_touches(faint: float) -> None:
     rng = np.random.default_rng(4)

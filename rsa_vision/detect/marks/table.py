@@ -29,6 +29,7 @@ _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
 _UNLIKE = 2.0  # times the misfit that is usual on the film
+_FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these may be what is seen of a tee; radians
 _ROOM = 2.0  # standard deviations: nearer to an end of the range the mean of what is left of the noise is not that of the film
 _OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
 
@@ -112,6 +113,7 @@ def table_of(
     arms = np.array([len(t.angles) for t in tees])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
+    flags[n:][_perhaps_arms(tees)] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
     unknown = ~np.isfinite(covariance).all(axis=(1, 2))
     poor |= unknown
@@ -138,6 +140,21 @@ def table_of(
     high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
     trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
+
+
+def _perhaps_arms(needles: list[NeedleFit]) -> Bool:
+    """Say which pins are parallel to an arm of the nearest tee, where they are few beside tees: an edge may hide the rest of one."""
+    pin = np.array([len(f.angles) == 1 for f in needles], bool)
+    tees = [f for f, single in zip(needles, pin, strict=True) if not single]
+    out = np.zeros(len(needles), bool)
+    if np.count_nonzero(pin) * _FEW_PINS > len(tees):
+        return out
+    place = np.array([t.position_px for t in tees]).reshape(-1, 2)
+    for k in np.flatnonzero(pin):
+        nearest = tees[int(np.hypot(*(place - needles[k].position_px).T).argmin())]
+        apart = np.angle(np.exp(1j * (nearest.angles - needles[k].angles[0])))
+        out[k] = np.abs(apart).min() < _PARALLEL
+    return out
 
 
 def _noise_is_cut_off(fit: NeedleFit, noise: NoiseModel) -> bool:
