@@ -42,6 +42,8 @@ class Window:
         Where they lie in the smallest box around them.
     box : tuple of int
         Its rows and columns.
+    hidden : ndarray of shape (2, m)
+        (col, row) of pixels among these that are saturated, or off the film.
     """
 
     cols: Float
@@ -52,6 +54,7 @@ class Window:
     half: int
     place: Int
     box: tuple[int, int]
+    hidden: Float
 
     def filtered(self, values: Float, through: Filter) -> Float:
         """Filter values at the pixels, in units of the noise, shape (p, n)."""
@@ -79,7 +82,8 @@ def window_of(
     middle = np.mean([f.position_px for f in needles], axis=0)
     spread = max(float(np.abs(f.position_px - middle).max()) for f in needles)
     half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in needles) + 3 * optics.sigma_px + 3))
-    patch = apart_from_repairs(cut(film, middle[None], half, noise), noise)
+    whole = cut(film, middle[None], half, noise)
+    patch = apart_from_repairs(whole, noise)
     corner = patch.corner_px[0].astype(np.float64)
     axis = np.arange(float(patch.size))
     near = np.zeros((patch.size, patch.size), bool)
@@ -92,7 +96,9 @@ def window_of(
     place = (rows - rows[0]) * box[1] + cols - first
     cols, rows = cols + corner[0], rows + corner[1]
     beside = np.zeros_like(raw) if others is None else others(cols, rows)
-    return Window(cols, rows, raw - beside, beside, polynomial(half, cols - middle[0], rows - middle[1]).T, half, place, box)
+    surface = polynomial(half, cols - middle[0], rows - middle[1]).T
+    hidden = np.array(np.nonzero(near & ~whole.valid[0])[::-1]) + corner[:, None]
+    return Window(cols, rows, raw - beside, beside, surface, half, place, box, hidden)
 
 
 def chi2_of(window: Window, fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
@@ -149,7 +155,7 @@ def fit_crossing(
         variance = float(noise.variance_at(np.array([background]))[0])
         fits = [replace(f, depths=np.full(f.angles.shape, depth), converged=converged) for f, depth in zip(now, theta, strict=False)]
         of_each = zip(fits, theta[: len(now), None] * tees[:, 0], strict=True)
-        return [scored(f, image, residual, weight, surface, background, variance) for f, image in of_each]
+        return [scored(f, image, residual, weight, surface, background, variance, window.hidden, optics) for f, image in of_each]
 
     for step in range(steps + 1):
         last = step == steps or converged  # nobody asks where to go next

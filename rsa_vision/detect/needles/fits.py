@@ -12,7 +12,7 @@ from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.find import CHANCE
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution
-from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, arm_images, support
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float
 
@@ -21,6 +21,7 @@ _DEEPER = 2.0  # times the height of an image: a depth beyond that is what thin 
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
 _CLOSE_PX = 0.1
 _MOVES = 5  # tip, half width, length, direction
+_UNDER = 0.08  # of the height of an image, from which a pixel lies under it
 PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
 STANDS_OUT = 15.0  # significance from which noise may hide the form: what is chosen of a film's places stands out less
 
@@ -58,7 +59,8 @@ def fit_needles(
     NeedleFit
     """
     half = int(np.ceil(shape.length_px * 1.15 + shape.half_width_px + 3 * optics.sigma_px + 3))
-    patch = apart_from_repairs(cut(film, tip_px[None], half, noise), noise)
+    whole = cut(film, tip_px[None], half, noise)
+    patch = apart_from_repairs(whole, noise)
     corner = patch.corner_px[0].astype(np.float64)
     axis = np.arange(float(patch.size))
     margin = 3 * optics.sigma_px + (1.0 if quick else 4.0)
@@ -104,7 +106,8 @@ def fit_needles(
         converged=converged,
     )
     variance = float(noise.variance_at(np.array([background]))[0])
-    return scored(fit, image, residual, weight, surface, background, variance)
+    hidden = np.array(np.nonzero(near & ~whole.valid[0])[::-1]) + corner[:, None]
+    return scored(fit, image, residual, weight, surface, background, variance, hidden, optics)
 
 
 def step_of(gram: Float, theta: Float, each: int, damping: float) -> Float:
@@ -135,7 +138,17 @@ def between(value: float, low: float, high: float) -> float:
     return min(max(float(value), low), high)
 
 
-def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface: Float, background: float, variance: float) -> NeedleFit:
+def scored(
+    fit: NeedleFit,
+    image: Float,
+    residual: Float,
+    weight: Float,
+    surface: Float,
+    background: float,
+    variance: float,
+    hidden: Float,
+    optics: Optics,
+) -> NeedleFit:
     """Return a fit with its figures of merit, taken under its own arms.
 
     Parameters
@@ -147,6 +160,9 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
         Parts of the background.
     background, variance : float
         Film value, and of the noise there.
+    hidden : ndarray of shape (2, m)
+        (col, row) of pixels beside and under its arms that are saturated, or off the film.
+    optics : Optics
 
     Returns
     -------
@@ -162,6 +178,11 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
     raised = float((weight * (residual + image) ** 2)[core].sum())
     chi2_core = left / n_core if n_core else np.inf
     whole = len(fit.angles) * fit.shape.half_width_px * fit.shape.length_px * (2 - fit.shape.taper)  # outlines, were nothing hidden
+    if hidden.size:
+        dx, dy = hidden - fit.position_px[:, None]
+        whole = min(whole, n_core + int((np.abs(needle_image(dx, dy, fit, optics)) > _UNDER * peak).sum()))
+    else:
+        whole = n_core
     return replace(
         fit,
         depth=depth,
@@ -178,7 +199,7 @@ def scored(fit: NeedleFit, image: Float, residual: Float, weight: Float, surface
 
 def under(image: Float) -> Bool:
     """Pixels (n,) under the arms of an image."""
-    return np.asarray(np.abs(image) > 0.08 * max(float(np.abs(image).max(initial=0.0)), 1e-9))
+    return np.asarray(np.abs(image) > _UNDER * max(float(np.abs(image).max(initial=0.0)), 1e-9))
 
 
 def significance_of(image: Float, surface: Float, weight: Float) -> float:

@@ -160,7 +160,7 @@ def fit_shared(
     of_common = _common_errors(systems, by_noise, normal, precision, under)
     out = []
     for window, e, members, scatter in zip(windows, systems, at.sets, by_noise, strict=True):
-        out += _finished(window, e, members, under * scatter, of_common, noise, converged)
+        out += _finished(window, e, members, under * scatter, of_common, optics, noise, converged)
     tips = [scatter[: len(e.tips), : len(e.tips)] for scatter, e in zip(by_noise, systems, strict=True)]
     by_ground = np.concatenate(errors_by_ground(film, windows, systems, tips, out, through))
     return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, by_ground, strict=True)], optics
@@ -311,7 +311,14 @@ def _common_errors(systems: list[Equations], by_noise: list[Float], normal: Floa
 
 
 def _finished(
-    window: Window, e: Equations, members: list[NeedleFit], by_noise: Float, errors: Float, noise: NoiseModel, converged: bool
+    window: Window,
+    e: Equations,
+    members: list[NeedleFit],
+    by_noise: Float,
+    errors: Float,
+    optics: Optics,
+    noise: NoiseModel,
+    converged: bool,
 ) -> list[NeedleFit]:
     by_common, tips = e.own_by_common[e.tips], slice(len(e.tips))
     covariance = by_noise[tips, tips] + by_common @ errors @ by_common.T
@@ -322,5 +329,5 @@ def _finished(
     for i, (fit, image) in enumerate(zip(members, e.images, strict=True)):
         at = slice(2 * i, 2 * i + 2)
         fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
-        out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance))
+        out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance, window.hidden, optics))
     return out
