@@ -42,6 +42,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 __all__ = ["Detection", "detect_markers"]
 
 _BEYOND = 4.0  # times what first looks show of the other polarity: marks that are found leave it no chance
+_OVER, _PULL = 0.1, 0.1  # of the depth of a ball, from which a needle lies over it; of its radius, by which that moves its centre
 BENT = 1.5  # of what a ball may leave, once an edge or bending surfaces around it could have taken it up
 
 
@@ -170,6 +171,9 @@ def _one_polarity(
     clear = balls.rows(~touching & ~drawn & (balls.valid_fraction > WHOLE) & (balls.chi2_ring < STRUCTURE))
     under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
     balls, ratio, by_size, covered = settle(film, balls, places, under, ~touching & ~drawn, edged, beside, optics, noise)
+    if needles is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
+        over = needles.under(balls.position_px, balls.radius_px) > _OVER * np.abs(balls.depth)
+        touching, by_size = touching | over, by_size + over * (_PULL * balls.radius_px) ** 2
     left, poor = what_is_left(balls, under, optics.sigma_px, noise)
     poor |= covered
     keep = left < BENT * MISFIT

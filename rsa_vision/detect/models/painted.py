@@ -16,6 +16,7 @@ from rsa_vision.types import Bool, Float, Int
 _BLURS = 4.0  # beyond which an image has faded
 _EXPLAINED = 0.8  # of the contrast of a place, made by needles: the rest is less than the half of an arm that a ball must be
 _SAMPLES = 12
+_RINGS = (0.0, 0.5, 1.0)  # of a radius, on which samples lie
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +74,13 @@ class Painted:
 
         ours, all_of_it = contrast(self), contrast(lambda cols, rows: _at(film, cols, rows))
         return np.asarray((np.abs(ours) > 0) & (np.abs(all_of_it - ours) < (1 - _EXPLAINED) * np.abs(ours)))
+
+    def under(self, position_px: Float, radius_px: Float) -> Float:
+        """Return the largest difference that needles make somewhere under discs at these places (n, 2), in film values, shape (n,)."""
+        angle = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
+        steps = np.concatenate([part * np.stack([np.cos(angle), np.sin(angle)]) for part in _RINGS], axis=1)
+        cols, rows = position_px.T[:, :, None] + radius_px[:, None] * steps[:, None]
+        return np.asarray(np.abs(self(cols, rows)).max(axis=1, initial=0.0))
 
 
 def paint(needles: list[tuple[NeedleFit, Optics]]) -> Painted:
