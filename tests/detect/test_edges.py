@@ -66,7 +66,7 @@ def test_balls_at_rims_of_implants(density: float, from_rim: float) -> None:
 
 def test_balls_at_corners_of_implants_are_where_they_are_said_to_be() -> None:
     ratios: list[float] = []
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         rng = np.random.default_rng(seed)
         axis = np.arange(55, SIDE, 85.0)
         balls = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)

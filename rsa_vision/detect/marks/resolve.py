@@ -89,10 +89,12 @@ def resolve_balls(
 
     groups, fits = groups_worth_fitting(), []
     clear = look_clear(good, noise)
-    like = good.rows(clear) if np.count_nonzero(clear) >= LEAST_KNOWN else good
-    for members in _unexplained_pairs(film, candidates, good, like, optics, tees):
+    sized = bool(np.count_nonzero(clear) >= LEAST_KNOWN)
+    like = good.rows(clear) if sized else good
+    for members in _unexplained_pairs(film, candidates, good, like, sized, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
-        while len(pair.depth) > 2 and not _like(pair, like).all():  # one peak too many takes part of a ball, and then there is none
+        # one peak too many takes part of a ball, and then there is none
+        while sized and len(pair.depth) > 2 and not _like(pair, like).all() and np.count_nonzero(plausible(pair, noise)) > 1:
             pair = pair.rows(np.arange(len(pair.depth)) != pair.significance.argmin())
             pair = fit_group(film, pair.position_px, np.full(len(pair.depth), members[0, 2]), optics.sigma_px, optics.mu_px, noise, tees)
         fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
@@ -242,9 +244,12 @@ def inside(fits: BallFits, film: NDArray[Any]) -> Bool:
 
 
 def _unexplained_pairs(
-    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, optics: Optics, tees: Background | None
+    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, sized: bool, optics: Optics, tees: Background | None
 ) -> list[Float]:
-    """Starts of groups, rows of (col, row, radius), at peaks off all known balls; ``like`` says what a ball is like on this film."""
+    """Starts of groups, rows of (col, row, radius), at peaks off all known balls.
+
+    ``like`` says what a ball is like on this film; ``sized``: and how large it is.
+    """
     if len(good.depth) == 0:
         return []
     typical = float(np.median(like.radius_px))
@@ -265,7 +270,7 @@ def _unexplained_pairs(
             continue
         gap = np.hypot(*(peaks - peaks[i]).T)
         company = np.nonzero((gap < 2 * typical + TOUCH * optics.sigma_px) & (gap > 0.6 * typical) & free & ~used)[0]
-        if len(company) > _COMPANY:  # fine peaks lie all along the rim of a large ball
+        if sized and len(company) > _COMPANY:  # fine peaks lie all along the rim of a large ball
             company = company[candidates.radius_px[fine[company]] > _COARSE * typical]
         company = company[np.argsort(gap[company])][: MOST_IN_GROUP - 1]
         known = good.position_px[np.hypot(*(good.position_px - peaks[i]).T) < 2 * typical + TOUCH * optics.sigma_px]

@@ -18,9 +18,9 @@ from rsa_vision.types import Float
 OF_STRETCH = np.array([[1.0, 0.0], [-0.5, 0.5], [-0.5, -0.5]])
 ARMS, WAYS = 3, 4  # leans of the two halves of the bar against the stem, and these
 _ALIKE = 1e-4  # radians and logarithms by which regular arms differ
-_BY_CHANCE, _OUTLIER = 3.0, 5.0  # standard deviations: of the mean square by which all differ; of one that is as odd as any
+_BY_CHANCE, _OUTLIER = 3.0, 3.0  # standard deviations: of the mean square by which all differ; of one that is as odd as any
 _LEAST = 4  # tees that can tell
-_MOST = 0.3  # of a way
+_MOST = 0.3  # radians and logarithms, of a way
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +86,8 @@ def told_by(ways: list[Float], variances: list[Float], known: Regularity) -> Reg
     typical, spread = known.typical.copy(), np.full(values.shape, _ALIKE)
     for way in range(WAYS):
         centre, sd, belongs = true_spread(values[:, way], variance[:, way])
+        if not sd < _MOST:
+            return None  # whatever crosses there, these are no arms of tees
         typical[way], spread[:, way] = centre, np.where(belongs, sd, np.inf)
     parts = np.cumsum([len(of) for of in ways])[:-1]
     return Regularity(known.common, typical, np.split(spread, parts))
