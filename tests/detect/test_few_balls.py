@@ -100,8 +100,7 @@ def test_a_soft_shadow_among_faint_balls_is_none(reach_px: float) -> None:
     assert nearest(truth, found)[1].max() < 1.0
 
 
-@pytest.mark.parametrize("radius_px", [4.0, 8.0, 12.0])
-@pytest.mark.parametrize("part", [0.1, 0.25])
+@pytest.mark.parametrize(("radius_px", "part"), [(4.0, 0.1), (8.0, 0.1), (8.0, 0.25), (12.0, 0.25)])
 @pytest.mark.parametrize("bright", [False, True])
 def test_large_balls_cut_off_by_the_end_of_the_values_are_found_and_flagged(radius_px: float, part: float, bright: bool) -> None:
     rng = np.random.default_rng(3)

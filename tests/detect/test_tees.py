@@ -69,7 +69,7 @@ def test_nothing_left_of_what_looked_like_tees_is_no_error(monkeypatch: pytest.M
     assert find_tees(film, np.zeros((1, 5)), np.zeros((0, 6)), optics, estimate_noise(film, 16)) == ([], [], optics)
 
 
-@pytest.mark.parametrize("count", [1, 3, 9])
+@pytest.mark.parametrize("count", [1, 9])
 def test_tees_that_point_anywhere_are_tees(count: int) -> None:
     for seed in range(3):
         rng = np.random.default_rng(100 * count + seed)
