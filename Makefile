@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint docs bench lock clean
+.PHONY: demo test lint lint-code lint-types lint-docs docs bench lock clean
 
 demo: $(STAMP)  ## a small synthetic study, rendered and measured, with its report
 	$(BIN)/rsa-vision demo demo
@@ -12,11 +12,17 @@ demo: $(STAMP)  ## a small synthetic study, rendered and measured, with its repo
 test: $(STAMP)  ## one worker a processor, each with one thread: more of them get in the way
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
-lint: $(STAMP)
+lint: lint-code lint-types lint-docs  ## side by side with make -j
+
+lint-code: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+lint-types: $(STAMP)
+	$(BIN)/mypy
+
+lint-docs: $(STAMP)
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
 
 docs: $(STAMP)
