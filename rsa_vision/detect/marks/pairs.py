@@ -50,7 +50,7 @@ def optics_of_pairs(
     optics, evidence : Optics, float
         As of :func:`rsa_vision.detect.balls.optics.estimate_optics`; None where there are single balls enough, and where no pairs are.
     looks : BallFits
-        These pairs, and what may be more of them.
+        These pairs, and what may be more of them; several may have come to the same place.
     """
     sure = _surest(seeds)
     if len(sure.depth) == 0:
@@ -88,8 +88,8 @@ def optics_of_pairs(
     found = [pair for pair, blob in zip(as_two(sigma), blobs, strict=True) if _are_two(pair, blob, noise)]
     if not found:
         return None
-    others = distinct(first_look(film, candidates, noise, slack=ANYTHING), noise)
-    return Optics(sigma, KAPPA / sigma), ball_evidence(join(found), noise), join([distinct(join(found), noise), others])
+    others = first_look(film, candidates, noise, slack=ANYTHING)
+    return Optics(sigma, KAPPA / sigma), ball_evidence(join(found), noise), join([*found, others])
 
 
 def _surest(seeds: BallFits) -> BallFits:

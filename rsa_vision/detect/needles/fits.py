@@ -177,12 +177,12 @@ def scored(
     left = float(square[core].sum())
     raised = float((weight * (residual + image) ** 2)[core].sum())
     chi2_core = left / n_core if n_core else np.inf
-    whole = len(fit.angles) * fit.shape.half_width_px * fit.shape.length_px * (2 - fit.shape.taper)  # outlines, were nothing hidden
+    outlines = len(fit.angles) * fit.shape.half_width_px * fit.shape.length_px * (2 - fit.shape.taper)
+    behind = 0
     if hidden.size:
         dx, dy = hidden - fit.position_px[:, None]
-        whole = min(whole, n_core + int((np.abs(needle_image(dx, dy, fit, optics)) > _UNDER * peak).sum()))
-    else:
-        whole = n_core
+        behind = int((np.abs(needle_image(dx, dy, fit, optics)) > _UNDER * peak).sum())
+    whole = min(outlines, n_core + behind)  # were nothing hidden; on steep curves outlines vanish
     return replace(
         fit,
         depth=depth,
