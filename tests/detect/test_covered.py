@@ -41,8 +41,8 @@ def tips_of(rng: np.random.Generator) -> Float:
     return (np.stack([cols, rows], axis=1) + 0.5) * (SIDE / CELLS) + rng.uniform(-12, 12, (CELLS**2, 2))
 
 
-def exposed(clear: Float, rng: np.random.Generator) -> np.ndarray:
-    counts = rng.poisson(0.6 * gaussian_filter(clear, SIGMA_PX) * QUANTA) / QUANTA
+def exposed(clear: Float, rng: np.random.Generator, blur_px: float | tuple[float, float] = SIGMA_PX) -> np.ndarray:
+    counts = rng.poisson(0.6 * gaussian_filter(clear, blur_px) * QUANTA) / QUANTA
     return np.clip(np.rint(50000 * counts), 0, 65535).astype(np.uint16)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
-from rsa_vision.detect.models.needles import NeedleShape, arm_images, film_curve
+from rsa_vision.detect.models.needles import NeedleShape, arm_images, arms_by_optics, film_curve
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin
@@ -16,14 +16,14 @@ HALF, FINE, SIGMA, MU, TURN = 36, 7, 1.1, 0.6, 0.4
 SHAPE = NeedleShape(3.1, 24.4)
 
 
-def exact(along: float, across: float) -> np.ndarray:
+def exact(along: float, across: float, blur_px: float | tuple[float, float] = SIGMA) -> np.ndarray:
     """Blurred opacity of a cone that rays of these slopes cross, attenuation counted along the film's normal."""
     line = (np.arange((2 * HALF + 1) * FINE) + 0.5) / FINE - 0.5 - HALF
     x, y = np.meshgrid(line, line)
     axis, side = np.array([np.cos(TURN), -np.sin(TURN), 0.0]), np.array([np.sin(TURN), np.cos(TURN), 0.0])
     ray = np.array([0.0, 0.0, 1.0]) + along * axis + across * side
     chord = chord_pin(np.array([x, y, 0 * x]), ray, np.zeros(3), axis, SHAPE.length_px, SHAPE.half_width_px) / np.linalg.norm(ray)
-    return gaussian_filter(-np.expm1(-MU * chord), SIGMA * FINE).reshape(2 * HALF + 1, FINE, 2 * HALF + 1, FINE).mean((1, 3))
+    return gaussian_filter(-np.expm1(-MU * chord), np.multiply(blur_px, FINE)).reshape(2 * HALF + 1, FINE, 2 * HALF + 1, FINE).mean((1, 3))
 
 
 def modelled(slant: float, skew: float, across: float = 0.0) -> np.ndarray:
@@ -45,6 +45,30 @@ def test_tables_are_the_image_of_a_cone_at_any_slant(along: float, across: float
     assert np.sqrt(((ours - image) ** 2).sum() / (image**2).sum()) < 0.025
     if along > 0.2:
         assert np.abs(modelled(0.0, 0.0, across) - image).max() > 2 * np.abs(ours - image).max()
+
+
+@pytest.mark.parametrize("blur_px", [(1.1, 1.1), (1.4, 0.9), (0.9, 1.4)])
+def test_tables_are_the_image_of_blur_that_differs_by_direction(blur_px: tuple[float, float]) -> None:
+    image = exact(0.0, 0.0, blur_px)
+    across, along = np.square(blur_px) + 1 / 12  # rows, columns
+    rows, cols = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].astype(float)
+    optics = Optics(np.sqrt((along + across) / 2), MU, uneven=((along - across) / (along + across), 0.0))
+    ours = arm_images(cols.ravel(), rows.ravel(), np.array([TURN]), SHAPE, optics)[0].reshape(rows.shape)
+    assert np.abs(ours - image).max() < 0.03
+    assert np.sqrt(((ours - image) ** 2).sum() / (image**2).sum()) < 0.02
+
+
+def test_derivatives_by_what_is_uneven() -> None:
+    rows, cols = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].reshape(2, -1).astype(float)
+    angles, step = np.array([0.3, 1.87, -1.27]), 0.3  # so far that the grid of tables does not show
+    slopes = arms_by_optics(cols, rows, angles, SHAPE, Optics(SIGMA, MU))[-2:].reshape(2, -1)
+    for slope, uneven in zip(slopes, ((step, 0.0), (0.0, step)), strict=True):
+        high, low = (
+            arm_images(cols, rows, angles, SHAPE, Optics(SIGMA, MU, uneven=(sign * uneven[0], sign * uneven[1])))[0] for sign in (1, -1)
+        )
+        expected = (high - low).ravel() / (2 * step)
+        assert slope @ expected > 0.98 * np.linalg.norm(slope) * np.linalg.norm(expected)
+        assert 0.9 < np.linalg.norm(slope) / np.linalg.norm(expected) < 1.1
 
 
 @pytest.mark.parametrize(

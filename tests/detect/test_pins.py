@@ -28,11 +28,12 @@ def film_of_pins(
     quanta: float = QUANTA,
     response: str = "linear",
     tail: float = 0.0,
+    unevenly: float = 1.0,
 ) -> tuple[np.ndarray, Float, Float]:
     """Sixteen pins of 0.5 x 2 mm in all directions, exact chords; tips and directions away from them, both (n, 2), (col, row).
 
     Every third is ``smaller`` by that factor. ``response``: ``density``, of film with half as much scattered light. ``tail``: part of the
-    light that is spread four times as far.
+    light that is spread four times as far. ``unevenly``: so many times as far along columns as along rows.
     """
     clear = np.ones((SIDE, SIDE))
     cell, half = SIDE // CELLS, 34
@@ -52,7 +53,8 @@ def film_of_pins(
         clear[corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= left
         tips.append(tip)
         ways.append(way)
-    seen = (1 - tail) * gaussian_filter(clear, SIGMA_PX) + tail * gaussian_filter(clear, 4 * SIGMA_PX)
+    blur = SIGMA_PX * np.sqrt(unevenly), SIGMA_PX / np.sqrt(unevenly)
+    seen = (1 - tail) * gaussian_filter(clear, blur) + tail * gaussian_filter(clear, 4 * SIGMA_PX)
     counts = rng.poisson(base * seen * quanta) / quanta
     if response == "density":
         counts = 1 / (1 + (DENSE / (counts + 0.5 * base)) ** 2)

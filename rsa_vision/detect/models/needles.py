@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft2, rfft2
 from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.detect.models.profiles import TAIL, Optics
@@ -27,6 +28,7 @@ GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of t
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
 _LOG_GRID = math.log(GRID)
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
+_UNEVEN_GRID = 0.02  # between what is uneven, of the blur of an arm, that has tables of its own
 _PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
 
@@ -115,13 +117,15 @@ def _opacity(
 
     A ray in depth ``z`` of the needle crosses it at the distance ``s + sqrt(slant) z`` from the tip; of its chord only the part before the
     flat end counts. The middle of the chord lies the further behind the further it is from the axis: ``skew`` times the distance.
+    What is uneven of the blur is that along the needle against across, and the covariance of both.
     """
     cell = _cell(optics.sigma_px)
     first, (n_s, n_p) = _grid(half_width, length, optics.sigma_px)
     cell_s, cell_p = cell * longer, cell * wider
     s = first[0] * longer + cell_s * np.arange(n_s)
-    # without skew one half; the other is its mirror image
-    p = first[1] * wider + cell_p * np.arange(n_p) if skew else cell_p * np.arange(n_p // 2 + 1)
+    along, oblique = optics.uneven
+    mirrored = not (skew or oblique)  # one half is enough
+    p = cell_p * np.arange(n_p // 2 + 1) if mirrored else first[1] * wider + cell_p * np.arange(n_p)
     half_width, length = half_width * wider, length * longer
     fine_s = (s[:, None] + cell_s * (np.arange(2) - 0.5) / 2).reshape(-1, 1)
     fine_p = (p[:, None] + cell_p * (np.arange(2) - 0.5) / 2).ravel()
@@ -134,16 +138,26 @@ def _opacity(
     opacity = opacity.reshape(len(s), 2, len(p), 2).mean((1, 3))
 
     def blurred(sigma: float) -> Float:
-        blur_s, blur_p = (np.sqrt(max(sigma**2 / cell**2 - _OF_TABLE, 0.1)) for cell in (cell_s, cell_p))
-        along = gaussian_filter1d(opacity, blur_s, axis=0, mode="constant", truncate=4.5)
-        return np.asarray(gaussian_filter1d(along, blur_p, axis=1, mode="constant" if skew else "mirror", truncate=4.5))
+        parts = (1 + along, cell_s), (1 - along, cell_p)
+        var_s, var_p = (max(part * sigma**2 / cell**2 - _OF_TABLE, 0.1) for part, cell in parts)
+        if oblique:
+            return _obliquely_blurred(opacity, var_s, var_p, oblique * sigma**2 / (cell_s * cell_p))
+        lengthwise = gaussian_filter1d(opacity, np.sqrt(var_s), axis=0, mode="constant", truncate=4.5)
+        return np.asarray(gaussian_filter1d(lengthwise, np.sqrt(var_p), axis=1, mode="mirror" if mirrored else "constant", truncate=4.5))
 
     seen = blurred(blurrier * optics.sigma_px)
     if optics.tail:
         seen += optics.tail * (blurred(TAIL * blurrier * optics.sigma_px) - seen)
     if any(optics.curve):
         seen = film_curve(seen, optics.curve)[0]
-    return seen if skew else np.concatenate([seen[:, :0:-1], seen], axis=1)
+    return np.concatenate([seen[:, :0:-1], seen], axis=1) if mirrored else seen
+
+
+def _obliquely_blurred(image: Float, var_s: float, var_p: float, covariance: float) -> Float:
+    """Blur by a Gaussian of this covariance matrix, in cells; what leaves one end comes in at the other, where the image has faded."""
+    at_s, at_p = 2 * np.pi * np.fft.fftfreq(image.shape[0])[:, None], 2 * np.pi * np.fft.rfftfreq(image.shape[1])
+    passed = np.exp(-0.5 * (var_s * at_s**2 + 2 * covariance * at_s * at_p + var_p * at_p**2))
+    return np.asarray(irfft2(rfft2(image) * passed, s=image.shape), np.float64)
 
 
 def film_curve(opacity: Float, curve: tuple[float, float]) -> Float:
@@ -184,7 +198,7 @@ def _table(half_width: float, length: float, taper: float, optics: Optics, slant
     """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
     ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur, by
-    the taper, by the curve and by the tail, alone.
+    the taper, by the curve, by the tail and by what is uneven, alone.
     """
     one = half_width, length, taper, optics, slant
     base = _opacity(*one)
@@ -203,7 +217,12 @@ def _table(half_width: float, length: float, taper: float, optics: Optics, slant
         straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0)), slant)
         spread = _opacity(half_width, length, taper, replace(optics, tail=optics.tail + STEP), slant)
         _, *by_curve = film_curve(straight, optics.curve)
-        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *by_curve, (spread - base) / STEP]
+        uneven = [
+            _opacity(half_width, length, taper, replace(optics, uneven=(optics.uneven[0] + along, optics.uneven[1] + oblique)), slant)
+            for along, oblique in ((STEP, 0.0), (0.0, STEP))
+        ]
+        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *by_curve]
+        nodes += [(more - base) / STEP for more in (spread, *uneven)]
     table = np.array(nodes, np.float32)
     table[:, [0, -1]] = table[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return table
@@ -272,9 +291,21 @@ def arm_images(
 
 
 def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> Float:
-    """Derivatives of every arm by log attenuation, log blur, taper, the two of the curve and tail; how the ends slant hardly matters."""
+    """Derivatives of every arm by all of an :class:`Optics`, on the first axis; how the ends slant hardly matters.
+
+    In order: logarithms of attenuation and blur, taper, the two of the curve, tail, the two of what is uneven.
+    """
     seen = _Seen.of(dx, dy, angles, shape, optics)
-    return seen.spread(_look_up(_table(*seen.key, 0.0, "optics"), seen.at_s, seen.at_p))
+    *rows, by_along, by_oblique = seen.looked_up("optics", [0.0] * len(angles))
+    c, s = np.cos(2 * angles)[seen.arm], np.sin(2 * angles)[seen.arm]
+    return seen.spread([*rows, c * by_along + s * by_oblique, s * by_along - c * by_oblique])
+
+
+def _of_arm(uneven: tuple[float, float], angle: float) -> tuple[float, float]:
+    """What is uneven of a film's blur along an arm against across, and the covariance of both, on the grid of tables."""
+    c, s = math.cos(2 * angle), math.sin(2 * angle)
+    seen = uneven[0] * c + uneven[1] * s, uneven[0] * s - uneven[1] * c
+    return round(_UNEVEN_GRID * round(seen[0] / _UNEVEN_GRID), 4), round(_UNEVEN_GRID * round(seen[1] / _UNEVEN_GRID), 4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -285,6 +316,7 @@ class _Seen:
     """
 
     key: _Key
+    keys: list[_Key]  # of each arm: of blur that is not even they see different parts
     first: tuple[float, float]
     cell_s: float  # stretched, for an arm of the common length
     cell_p: float
@@ -307,21 +339,28 @@ class _Seen:
         within = (np.abs(at_s - middle[0]) < reach[0]) & (np.abs(at_p - middle[1]) < reach[1])
         index = np.flatnonzero(within)
         at = at_s.ravel().take(index), at_p.ravel().take(index)
-        return _Seen(key, first, cell_s, cell_p, index // len(dx), *at, index, within.shape)
+        keys = [key] * len(angles)
+        if max(map(abs, optics.uneven)) > _UNEVEN_GRID / 2:
+            keys = [(*key[:3], replace(key[3], uneven=_of_arm(optics.uneven, angle))) for angle in angles.tolist()]
+        return _Seen(key, keys, first, cell_s, cell_p, index // len(dx), *at, index, within.shape)
+
+    def looked_up(self, more: str, slants: list[float], last: int | None = None) -> Float:
+        """Interpolate the tables of the arms; most share one with the arm before."""
+        asked = list(zip(self.keys, slants, strict=True))
+        first = [0, *(k for k in range(1, len(asked)) if asked[k] != asked[k - 1])]
+        parts = pairwise([*np.searchsorted(self.arm, first).tolist(), len(self.arm)])
+        tables = [_table(*asked[k][0], asked[k][1], more)[:last] for k in first]
+        found = [_look_up(table, self.at_s[i:end], self.at_p[i:end]) for table, (i, end) in zip(tables, parts, strict=True)]
+        return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
 
     def values(self, shape: NeedleShape, slants: Float | None, *, slopes: bool) -> tuple[Float, list[Float]]:
         """Return the opacity and what else the tables hold."""
         last = None if slopes else -2
         if slants is None:
-            value, *more = _look_up(_table(*self.key, 0.0, "")[:last], self.at_s, self.at_p)
+            value, *more = self.looked_up("", [0.0] * len(self.keys), last)
         else:
             off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
-            of_arms = np.round(slants[0] - off_q, 4)
-            first = np.append(0, np.flatnonzero(np.diff(of_arms)) + 1)  # most arms share a table with the one before
-            parts = pairwise(np.searchsorted(self.arm, np.append(first, len(of_arms))).tolist())
-            tables = [_table(*self.key, q, "ends")[:last] for q in of_arms[first].tolist()]
-            found = [_look_up(table, self.at_s[i:end], self.at_p[i:end]) for table, (i, end) in zip(tables, parts, strict=True)]
-            value, *more = np.concatenate(found, axis=1)
+            value, *more = self.looked_up("ends", np.round(slants[0] - off_q, 4).tolist(), last)
             value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
         value += (shape.half_width_px - self.key[0]) * more[0] + (shape.length_px * self.of_arms(shape.arms) - self.key[1]) * more[1]
         return value, more

@@ -42,6 +42,9 @@ class Optics:
     proportion : float
         Change of a needle's depth with the background along it, both in film values: on a film that is linear in exposure a mark takes away
         a part of what is there, on a logarithmic one always the same.
+    uneven : tuple of float
+        Blur that differs by direction, of a focal spot that is no square or a scanner that reads lines: at the angle ``a`` its variance is
+        ``1 + uneven[0] cos 2a + uneven[1] sin 2a`` times the mean one. Tips of pins and tees ask for it; it moves no centre of a ball.
     rough : bool
         The blur is a guess to improve upon.
     """
@@ -51,6 +54,7 @@ class Optics:
     curve: tuple[float, float] = (0.0, 0.0)
     tail: float = 0.0
     proportion: float = 0.0
+    uneven: tuple[float, float] = (0.0, 0.0)
     rough: bool = False
 
 

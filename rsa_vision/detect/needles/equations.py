@@ -16,7 +16,9 @@ from rsa_vision.detect.needles.crossing import Window, gain_at, lapping
 from rsa_vision.detect.needles.irregular import ARMS, OF_STRETCH, WAYS, Regularity, ways_of
 from rsa_vision.types import Float, Int
 
-OPTICS, SHARED = 6, 8  # common to all: attenuation, blur, taper, curve (2), tail; then logarithms of half width and length; then directions
+# common to all: attenuation, blur, taper, curve (2), tail, uneven (2); then logarithms of half width and length; then directions
+UNEVEN = slice(6, 8)
+OPTICS, SHARED = 8, 10
 SLANT, SKEW = 0.11, 0.08  # root mean squares, of a square and a product of slopes: rays cross a film at slopes of up to a half
 # slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
 OF_SLANTS = {
@@ -158,7 +160,7 @@ def linearise(
     ----------
     window : Window
     members : list of NeedleFit
-    slopes : list of ndarrays of shape (6, k, n)
+    slopes : list of ndarrays of shape (8, k, n)
         As of :func:`by_optics`, one for each.
     optics : Optics
     noise : NoiseModel
@@ -256,6 +258,6 @@ def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
 
 
 def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
-    """Derivatives of each member's arms by what is common, shape (6, k, n), as of :func:`arms_by_optics`."""
+    """Derivatives of each member's arms by what is common, shape (8, k, n), as of :func:`arms_by_optics`."""
     offsets = [(window.cols - f.position_px[0], window.rows - f.position_px[1]) for f in members]
     return [arms_by_optics(*at, f.angles, f.shape, optics) for at, f in zip(offsets, members, strict=True)]

@@ -21,7 +21,7 @@ from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window, window_of
-from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, SHARED, SLANT, Equations, by_optics, linearise, own_parameters
+from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, SHARED, SLANT, UNEVEN, Equations, by_optics, linearise, own_parameters
 from rsa_vision.detect.needles.fits import between, scored
 from rsa_vision.detect.needles.grounds import errors_by_ground
 from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms, regular, told_by
@@ -41,10 +41,15 @@ _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much the
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
 _CURVE_ERROR, _TAIL_ERROR = (0.6, 0.1), 0.07
-# of attenuation, blur, taper, curve, tail: changes from which derivatives by them are taken anew
-_MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1])
-_NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1])  # changes of those with which the last step gets there
+# of what is uneven of the blur: where nothing tells it, and where balls or the needles themselves have told that it is
+_EVEN_ERROR, _UNEVEN_ERROR = 0.02, 0.2
+_OF_UNEVEN = np.eye(2) / _UNEVEN_ERROR**2
+_BY_CHANCE = 14.0  # chi2 of two degrees of freedom
+# of attenuation, blur, taper, curve, tail, uneven: changes from which derivatives by them are taken anew
+_MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1, 0.1, 0.1])
+_NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.1])  # changes of those with which the last step gets there
 _MOST = 3.0, 0.8, 0.6  # curve and tail
+_MOST_UNEVEN = 0.8
 _MOST_BY_STEP, _MOST_TAPER_BY_STEP = 0.6, 0.2  # of all these
 _SHORTER = 3  # attempts at a step that loses nothing
 _SQUARE_PX = (
@@ -93,7 +98,8 @@ def fit_shared(
     parallel = parallel and len(needles[0].angles) > 1
     sets = clusters(needles)
     windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
-    errors = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, _SIZE_ERROR, _SIZE_ERROR]
+    of_blur = _UNEVEN_ERROR if any(optics.uneven) else _EVEN_ERROR
+    errors = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, of_blur, of_blur, _SIZE_ERROR, _SIZE_ERROR]
     precision = np.diag(np.array(errors + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     # steps weigh pixels as if noise were white, and believe them the more the more neighbours share of it
     gain = float(noise.gain(np.hypot(optics.sigma_px, np.median([f.shape.half_width_px for f in needles]))))
@@ -101,7 +107,7 @@ def fit_shared(
     sizes = _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     arms = regular(sets) if len(needles[0].angles) == ARMS else None
     at = _State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, arms)
-    asked = not parallel
+    asked = False
     start, slopes, since = optics, list[list[Float]](), np.full(OPTICS, np.inf)
     last: list[Equations | None] = [None] * len(sets)
     before: tuple[_State, list[Equations], _Step] | None = None
@@ -122,10 +128,11 @@ def fit_shared(
         else:
             told = [e.information() for e in systems]
             normal = held + sum(matrix for matrix, _ in told)
+            target = np.sum([right for _, right in told], axis=0)
             if count == steps or converged:
                 break
             least, shorter = cost, 0
-            change = _change(normal, sum(target for _, target in told) - held @ at.moved, at.taper)
+            change = _change(normal, target - held @ at.moved, at.taper)
             if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
                 change[:OPTICS] = 0.0  # new tables for so little are not worth their time
             far = float(change @ normal @ change) / len(change)
@@ -135,8 +142,12 @@ def fit_shared(
             converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
             if (converged or count >= _ASKED_AFTER) and not asked:  # near enough to tell how far their arms differ
                 asked = True
-                if odd := _odd(systems, at, gain):
-                    at, converged, least, before = replace(at, regularity=odd), False, np.inf, None
+                odd = _odd(systems, at, gain) if parallel else None
+                if uneven := _is_uneven(precision, normal - held, target, at.moved, gain):
+                    precision[UNEVEN, UNEVEN] = _OF_UNEVEN
+                    held = precision * gain
+                if odd or uneven:
+                    at, converged, least, before = replace(at, regularity=odd or at.regularity), False, np.inf, None
                     continue
             if converged and not alike:
                 break  # from so near the last step gets there as well; that to the sizes of all is longer
@@ -246,13 +257,31 @@ def _odd(systems: list[Equations], at: _State, gain: float) -> Regularity | None
     return told_by(list(ways), [gain * v for v in variances], at.regularity)
 
 
+def _is_uneven(precision: Float, told: Float, target: Float, moved: Float, gain: float) -> bool:
+    """Say whether what needles tell, (c, c) and (c,), makes the blur uneven that was taken as even so far.
+
+    ``precision``: of the common parameters before; ``moved``: what they differ from the start; ``gain``: of the variances, by noise that
+    neighbours share.
+    """
+    free = precision.copy()
+    free[UNEVEN, UNEVEN] = _OF_UNEVEN
+    if (free == precision).all():
+        return False
+    covariance = np.linalg.inv(told + gain * free)
+    uneven = moved[UNEVEN] + (covariance @ (target - gain * free @ moved))[UNEVEN]
+    return bool(uneven @ np.linalg.solve(covariance[UNEVEN, UNEVEN], uneven) > gain * _BY_CHANCE)
+
+
 def _moved_optics(start: Optics, by: Float) -> Optics:
-    """Optics with these changes of the logarithms of attenuation and blur, of curve and tail."""
+    """Optics with these changes of the logarithms of attenuation and blur, of curve, tail and what is uneven."""
     bow, skewed, tail = (
-        between(was + step, -most, most) for was, step, most in zip((*start.curve, start.tail), by[3:], _MOST, strict=False)
+        between(was + step, -most, most) for was, step, most in zip((*start.curve, start.tail), by[3:6], _MOST, strict=True)
     )
     dense, blurred = np.exp(by[:2]).tolist()
-    return replace(start, mu_px=start.mu_px * dense, sigma_px=start.sigma_px * blurred, curve=(bow, skewed), tail=tail)
+    along, oblique = start.uneven + by[UNEVEN]
+    part = min(1.0, _MOST_UNEVEN / max(float(np.hypot(along, oblique)), 1e-9))
+    uneven = (float(along * part), float(oblique * part))
+    return replace(start, mu_px=start.mu_px * dense, sigma_px=start.sigma_px * blurred, curve=(bow, skewed), tail=tail, uneven=uneven)
 
 
 def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> list[NeedleFit]:
