@@ -33,6 +33,30 @@ _MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: 
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What a film shows if its marks are of one sign of depth.
+
+    Attributes
+    ----------
+    sign : int
+        Of depth: negative for marks darker than their surroundings.
+    looks : BallFits
+        First looks at what may be balls.
+    optics : Optics
+    noise : NoiseModel
+        With that at marks of this polarity.
+    weight : float
+        Evidence for it.
+    """
+
+    sign: int
+    looks: BallFits
+    optics: Optics
+    noise: NoiseModel
+    weight: float
+
+
 def first_looks(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> tuple[BallFits, list[int]]:
     """Look at candidates of both polarities, of one where the strongest leave no doubt which is the markers'.
 
@@ -115,7 +139,7 @@ def _of_arms(strokes: Float, sign: int) -> float:
 
 def polarities(
     film: NDArray[Any], signs: list[int], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
-) -> list[tuple[int, Optics, BallFits, NoiseModel, float]]:
+) -> list[Seen]:
     """Choose the signs of depth worth looking at: both only where neither is clearly the markers'.
 
     Parameters
@@ -130,8 +154,8 @@ def polarities(
 
     Returns
     -------
-    list of tuples
-        Sign, optics, first looks, noise (with that at marks of this polarity) and the evidence for it; most evidence first.
+    list of Seen
+        Most evidence first.
     """
     seen = {sign: _seen_as(sign, film, seeds, pins, candidates, noise) for sign in signs}
     best = max(signs, key=lambda sign: seen[sign].weight)
@@ -139,23 +163,10 @@ def polarities(
         return []
     least = _RIVAL * seen[best].weight if seen[best].weight > _LEAST_EVIDENCE else 0.0
     rivals = [sign for sign in signs if sign == best or seen[sign].weight >= least]
-    return [
-        (sign, seen[sign].optics, seen[sign].looks, seen[sign].noise, seen[sign].weight)
-        for sign in sorted(rivals, key=lambda sign: sign != best)
-    ]
+    return [seen[sign] for sign in sorted(rivals, key=lambda sign: sign != best)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """What a film shows if its marks are of one sign of depth, and how much speaks for that."""
-
-    looks: BallFits
-    optics: Optics
-    noise: NoiseModel
-    weight: float
-
-
-def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel) -> _Seen:
+def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel) -> Seen:
     of_sign = [p for p in pins if np.sign(p.depth) == sign]
     slim = [p for p in of_sign if is_slim(p)]  # by mottle no blur of pins is told
     looks = seeds.rows((np.sign(seeds.depth) == sign) & ~faint_beside(seeds, slim, COARSE_SIGMA_PX, noise))
@@ -183,4 +194,4 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
             of_pins, needles = optics_of_pins(film, of_sign + more, under)
             if needles > 0 or not len(looks.depth):  # else even one faint ball knows more of its blur than nobody
                 optics = of_pins
-    return _Seen(looks, optics, under, balls + needles + _of_tees(candidates, sign))
+    return Seen(sign, looks, optics, under, balls + needles + _of_tees(candidates, sign))

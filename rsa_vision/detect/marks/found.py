@@ -1,0 +1,225 @@
+"""All marks of one polarity of a film: its pins and tees, then its balls, then where they are and with which errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.decide import are_balls, faint_beside
+from rsa_vision.detect.balls.find import MISFIT, fit_at, plausible
+from rsa_vision.detect.balls.fits import BallFits, join
+from rsa_vision.detect.balls.leftover import noise_under
+from rsa_vision.detect.balls.surroundings import free_places
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.marks.mixed import part
+from rsa_vision.detect.marks.polarity import Seen, off_pins
+from rsa_vision.detect.marks.resolve import resolve_balls
+from rsa_vision.detect.marks.second_look import look_again
+from rsa_vision.detect.marks.settle import STRUCTURE, settle
+from rsa_vision.detect.marks.table import WHOLE, table_of, what_is_left
+from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.painted import Painted, paint
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.pins import find_pins, look_for_pins
+from rsa_vision.detect.needles.sets import is_located, on_arms
+from rsa_vision.detect.needles.tees import find_tees, is_tee
+from rsa_vision.detect.neighbours.beside import images_beside, lapping_balls
+from rsa_vision.detect.neighbours.oblong import are_oblong
+from rsa_vision.detect.neighbours.rims import goes_on
+from rsa_vision.detect.search.candidates import Candidates
+from rsa_vision.types import Bool, Float, MarkerImages
+
+_OVER, _PULL = 0.1, 0.1  # of the depth of a ball, from which a needle lies over it; of its radius, by which that moves its centre
+_BENT = 1.5  # of what a ball may leave, once an edge or bending surfaces around it could have taken it up
+
+
+def marks_of(
+    film: NDArray[Any],
+    bits: int,
+    seen: Seen,
+    rough_pins: list[NeedleFit],
+    candidates: Candidates,
+    faint: Candidates,
+    limit: float,
+    *,
+    mottled: bool,
+) -> tuple[MarkerImages, float]:
+    """Find and measure all marks of one polarity.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    bits : int
+        Significant bits.
+    seen : Seen
+        What the film shows of this polarity.
+    rough_pins : list of NeedleFit
+        What may be pins, of both.
+    candidates, faint : Candidates
+        Where to look at first, and again; of both.
+    limit : float
+        Significance that noise alone would exceed too often.
+    mottled : bool
+        The film shows nearly as much of the other polarity.
+
+    Returns
+    -------
+    images : MarkerImages
+    evidence : float
+        For this polarity.
+    """
+    mine = _of_sign(candidates, seen.sign)
+    needles = _find_needles(film, mine, _of_sign(faint, seen.sign).strokes, candidates.strokes, rough_pins, seen)
+    found, tees = _find_balls(film, mine, _of_sign(faint, seen.sign), needles, seen, limit, mottled=mottled)
+    return _measured(film, bits, found, replace(needles, tees=tees), seen.optics, seen.noise)
+
+
+def _of_sign(candidates: Candidates, sign: int) -> Candidates:
+    """Those of one sign of depth: strengths, of the filter's answer, have the other."""
+    junctions, strokes = (of[np.sign(of[:, at]) == -sign] for of, at in ((candidates.junctions, 4), (candidates.strokes, 5)))
+    return replace(candidates.rows(np.sign(candidates.strength) == -sign), junctions=junctions, strokes=strokes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Needles:
+    """Pins and tees of a film."""
+
+    tees: list[NeedleFit]
+    pins: list[NeedleFit]
+    doubtful: list[NeedleFit]  # tees with something else on them
+    tee_optics: Optics
+    looks: BallFits  # at balls, less those at pins
+    painted: Painted | None  # images of the tees and pins
+
+    @property
+    def all(self) -> list[NeedleFit]:
+        return self.tees + self.pins
+
+
+def _find_needles(
+    film: NDArray[Any], mine: Candidates, strokes: Float, all_strokes: Float, rough_pins: list[NeedleFit], seen: Seen
+) -> _Needles:
+    sign, optics, noise = seen.sign, seen.optics, seen.noise
+    tees, doubtful, tee_optics = find_tees(film, mine.junctions, strokes, optics, noise)
+    tees = [fit for fit in tees if np.sign(fit.depth) == sign]
+    tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seen.looks, optics, noise), strict=True) if not ball]
+    more_pins = look_for_pins(film, all_strokes[~on_arms(all_strokes[:, :2], tees)], noise)
+    pins, pin_optics = find_pins(film, [p for p in rough_pins + more_pins if np.sign(p.depth) == sign], tees, optics, noise)
+    pins = [p for p in pins if is_located(p)]
+    painted = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
+    return _Needles(tees, pins, doubtful, tee_optics, off_pins(seen.looks, more_pins), painted)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Balls:
+    """Balls of a film."""
+
+    fits: BallFits
+    touching: Bool  # (n,): fitted together with a neighbour, or perhaps two
+    edged: Bool  # (n,): fitted together with an edge
+    drawn: Bool  # (n,): fitted without some pixels, or with the film's focal spot
+
+    def rows(self, which: Bool) -> _Balls:
+        return _Balls(self.fits.rows(which), self.touching[which], self.edged[which], self.drawn[which])
+
+    def and_more(self, fits: BallFits, *, touching: Bool | bool, edged: Bool | bool, drawn: Bool | bool) -> _Balls:
+        flags = (
+            np.append(now, np.broadcast_to(more, len(fits.depth)))
+            for now, more in ((self.touching, touching), (self.edged, edged), (self.drawn, drawn))
+        )
+        return _Balls(join([self.fits, fits]), *flags)
+
+
+def _find_balls(
+    film: NDArray[Any], mine: Candidates, faint: Candidates, needles: _Needles, seen: Seen, limit: float, *, mottled: bool
+) -> tuple[_Balls, list[NeedleFit]]:
+    """Balls, and the tees with those that only a ball on them explains."""
+    sign, optics, noise, others = seen.sign, seen.optics, seen.noise, needles.all
+
+    def high(fits: BallFits) -> Bool:
+        return ~faint_beside(fits, others, optics.sigma_px, noise)
+
+    def bare(fits: BallFits) -> Bool:
+        """Say which are of this polarity, and on no needle."""
+        return np.asarray((np.sign(fits.depth) == sign) & ~_on_arms(fits, others))
+
+    found = _Balls(*resolve_balls(film, mine, needles.looks, limit, optics, noise, needles.painted))
+    found = found.rows(high(found.fits))
+    found = found.rows(are_balls(found.fits, limit, optics.sigma_px, noise, mottled=mottled) & bare(found.fits))
+    more, at_edge, crossed = look_again(film, faint, found.fits, limit, optics, noise, needles.painted)
+    like = are_balls(join([found.fits, more]), limit, optics.sigma_px, noise, mottled=mottled)[len(found.fits.depth) :]
+    like = like & bare(more) & high(more)
+    # the last fit does not know what was masked either
+    found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], drawn=crossed[like])
+    tees = needles.tees
+    for fit in needles.doubtful:
+        if both := part(film, fit, found.fits, optics, needles.tee_optics, noise, needles.painted or _nothing, is_tee):
+            tee, ball = both
+            found = found.rows(np.hypot(*(found.fits.position_px - ball.position_px[0]).T) > ball.radius_px[0])
+            found, tees = found.and_more(ball, touching=True, edged=False, drawn=False), [*tees, tee]
+    return found, tees
+
+
+def _measured(
+    film: NDArray[Any], bits: int, found: _Balls, needles: _Needles, optics: Optics, noise: NoiseModel
+) -> tuple[MarkerImages, float]:
+    """Where the marks are, with their errors and flags, and how much they speak for their polarity."""
+    known, touching, painted, others = found.fits, found.touching, needles.painted, needles.all
+
+    def beside(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+        return images_beside(known, np.array([i]), optics, painted, cols, rows)
+
+    place = np.array([t.position_px for t in others]).reshape(-1, 2)
+    reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
+    places = free_places(film, known, place, reach, optics, noise)
+    free = ~touching & ~found.drawn
+    clear = known.rows(free & (known.valid_fraction > WHOLE) & (known.chi2_ring < STRUCTURE))
+    under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
+    balls, ratio, by_size, covered = settle(film, known, places, under, free, found.edged, beside, optics, noise)
+    if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
+        over = painted.under(balls.position_px, balls.radius_px) > _OVER * np.abs(balls.depth)
+        touching, by_size = touching | over, by_size + over * (_PULL * balls.radius_px) ** 2
+    left, poor = what_is_left(balls, under, optics.sigma_px, noise)
+    poor |= covered
+    keep = left < _BENT * MISFIT
+    ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
+    keep &= ~(poor & ends)
+    poor |= are_oblong(film, balls, beside, optics, noise)
+    touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
+    balls, ratio, by_size, touching, poor = balls.rows(keep), ratio[keep], by_size[keep], touching[keep], poor[keep]
+    poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
+    return table_of(film, bits, balls, under, ratio, by_size, touching, poor, others, optics, noise)
+
+
+def _nothing(cols: Float, _: Float) -> Float:
+    return np.zeros(cols.shape)
+
+
+def _are_rather_balls(film: NDArray[Any], tees: list[NeedleFit], seeds: BallFits, optics: Optics, noise: NoiseModel) -> list[bool]:
+    """Say which tees a ball over their tip explains better: three thick arms that run into each other make a disc."""
+    result = [False] * len(tees)
+    tips = np.array([t.position_px for t in tees]).reshape(-1, 2)
+    gap = np.hypot(*(tips[:, None] - seeds.position_px[None]).transpose(2, 0, 1))
+    tee, seed = np.nonzero(gap < seeds.radius_px[None] + 1)
+    if len(tee):
+        balls = fit_at(film, seeds.position_px[seed], seeds.radius_px[seed], optics, noise, quick=True)
+        as_ball = plausible(balls, noise) & (np.hypot(*(balls.position_px - tips[tee]).T) < balls.radius_px + 1)
+        for k in np.flatnonzero(as_ball):
+            result[tee[k]] |= bool(balls.chi2_core[k] < tees[tee[k]].chi2_core)
+    return result
+
+
+def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
+    """Say which balls are left-overs of the thick ends of tees."""
+    out = np.zeros(len(balls.depth), bool)
+    for t in tees:
+        dx, dy = (balls.position_px - t.position_px).T
+        for angle, depth in zip(t.angles, t.depths, strict=True):
+            c, s = np.cos(angle), -np.sin(angle)
+            along, across = dx * c + dy * s, -dx * s + dy * c
+            on = (along > -2) & (along < t.shape.length_px + t.shape.half_width_px) & (np.abs(across) < t.shape.half_width_px + 1.5)
+            out |= on & (np.abs(balls.depth) < 0.5 * abs(depth))
+    return out
