@@ -96,14 +96,9 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     -------
     ndarray of bool, shape (n,)
     """
-    strength = over_clutter(fits)
-    spot = _spread(fits, sigma_px) < SPOT_PX
-    # what would be larger still than the fit may go is no ball of that size
-    sure = (strength > max(SURE, limit)) & ~spot & (fits.radius_px < RADIUS_PX[1])
-    close = misfit(fits, noise) < MISFIT
-    height = height_of(fits, sigma_px)
-    pattern = _not_faint(sure & close & (fits.explained > CLOSE), height)
-    radii = _sizes(fits, pattern, sigma_px)
+    strength, height = over_clutter(fits), height_of(fits, sigma_px)
+    sure, close = _are_sure(fits, limit, sigma_px), misfit(fits, noise) < MISFIT
+    pattern, radii = _pattern(fits, sure & close, sigma_px)
     if len(radii) < LEAST_KNOWN:
         # noise hides what marks are like here: those without company have to be clearer, and among structure noise is no excuse
         whole = sure & (misfit(fits, noise, CHANCE) < MISFIT)  # mottle and the crossings of ribs and vessels leave more than noise
@@ -126,6 +121,24 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
         quiet = sure & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.chi2_ring < _QUIET) & (strength > ALONE)
         alike |= quiet & (fits.radius_px < high) & (_of_like_spread(_spread(fits, sigma_px), quiet) >= LEAST_KNOWN)
     return np.asarray((fits.significance > limit) & alike & (sure | (strength > 0.5 * SURE)))
+
+
+def show_what_marks_are_like(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> bool:
+    """Say whether some balls are so clear that they tell what others of the film are like; as for :func:`are_balls`."""
+    clear = _are_sure(fits, limit, sigma_px) & (misfit(fits, noise) < MISFIT)
+    return len(_pattern(fits, clear, sigma_px)[1]) >= LEAST_KNOWN
+
+
+def _are_sure(fits: BallFits, limit: float, sigma_px: float) -> Bool:
+    spot = _spread(fits, sigma_px) < SPOT_PX
+    # what would be larger still than the fit may go is no ball of that size
+    return np.asarray((over_clutter(fits) > max(SURE, limit)) & ~spot & (fits.radius_px < RADIUS_PX[1]))
+
+
+def _pattern(fits: BallFits, clear: Bool, sigma_px: float) -> tuple[Bool, Float]:
+    """Say which stand as a pattern for others, and of which radii."""
+    pattern = _not_faint(clear & (fits.explained > CLOSE), height_of(fits, sigma_px))
+    return pattern, _sizes(fits, pattern, sigma_px)
 
 
 def faint_beside(fits: BallFits, needles: list[NeedleFit], sigma_px: float, noise: NoiseModel) -> Bool:

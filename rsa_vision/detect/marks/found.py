@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import are_balls, faint_beside
+from rsa_vision.detect.balls.crowd import out_of_a_crowd
+from rsa_vision.detect.balls.decide import are_balls, faint_beside, show_what_marks_are_like
 from rsa_vision.detect.balls.find import MISFIT, fit_at, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
@@ -33,6 +34,7 @@ from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float, MarkerImages
 
 _OVER, _PULL = 0.1, 0.1  # of the depth of a ball, from which a needle lies over it; of its radius, by which that moves its centre
+_AT_NEEDLES = 1.5  # of their lengths, from the tip: what the search answers to there is of a needle
 _BENT = 1.5  # of what a ball may leave, once an edge or bending surfaces around it could have taken it up
 
 
@@ -146,12 +148,20 @@ def _find_balls(
         """Say which are of this polarity, and on no needle."""
         return np.asarray((np.sign(fits.depth) == sign) & ~_on_arms(fits, others))
 
+    away = np.array([np.hypot(*(faint.position_px - n.position_px).T) > _AT_NEEDLES * n.shape.length_px for n in others])
+    beside_needles = faint.rows(away.all(axis=0)) if others else faint
+
+    def decided(fits: BallFits) -> Bool:
+        marks = are_balls(fits, limit, optics.sigma_px, noise, mottled=mottled)
+        if marks.any() and not show_what_marks_are_like(fits, limit, optics.sigma_px, noise):
+            marks[marks] = out_of_a_crowd(fits.rows(marks), beside_needles)
+        return marks
+
     found = _Balls(*resolve_balls(film, mine, needles.looks, limit, optics, noise, needles.painted))
     found = found.rows(high(found.fits))
-    found = found.rows(are_balls(found.fits, limit, optics.sigma_px, noise, mottled=mottled) & bare(found.fits))
+    found = found.rows(decided(found.fits) & bare(found.fits))
     more, at_edge, crossed = look_again(film, faint, found.fits, limit, optics, noise, needles.painted)
-    like = are_balls(join([found.fits, more]), limit, optics.sigma_px, noise, mottled=mottled)[len(found.fits.depth) :]
-    like = like & bare(more) & high(more)
+    like = decided(join([found.fits, more]))[len(found.fits.depth) :] & bare(more) & high(more)
     # the last fit does not know what was masked either
     found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], drawn=crossed[like])
     tees = needles.tees
