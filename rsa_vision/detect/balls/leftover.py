@@ -31,6 +31,7 @@ _QUARTILE = 0.25  # that tells: what is no ball leaves more
 _MORE = 0.3  # part by which the variance under them is more, that is worth it
 _BY_CHANCE = 4.5  # two standard deviations of that, of one pixel: of odd parts, and neighbours share theirs
 _DOUBLINGS = np.linspace(0.0, 5.0, 21)  # of the variance: hardly anything comes through the middle of a ball where nothing is scattered
+WIDE = 0.3  # of the height of marks: a gap in the values of the film's tiles, beyond which these tell nothing of the noise under marks
 _FARTHEST, _FAR = 0.75, 0.5  # quantile of how far balls reach beyond the curve, and part of it from which they tell how it goes on
 
 
@@ -53,16 +54,17 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least
     Returns
     -------
     NoiseModel
-        The same where too few tell, and where there is no more noise.
+        The same where too few tell, and where there is no more noise; without values beyond a gap, as shutters have.
     """
     clear = over_clutter(seeds) > SURE * np.sqrt(noise.gain(np.hypot(COARSE_SIGMA_PX, 0.5 * seeds.radius_px)))
     sure = seeds.rows(clear & (seeds.valid_fraction > _WHOLE) & (seeds.window_fraction > _INSIDE))
     if _pixels(sure) < least_pixels:
         return noise
     guess = guessed_optics(float(np.median(sure.radius_px)))
-    sign = np.sign(sure.depth[0])
+    sign, height = float(np.sign(sure.depth[0])), height_of(sure, guess.sigma_px)
+    noise = noise.before_gap(sign * float((sign * sure.background).max()), sign, WIDE * float(np.median(height)))
     end = noise.level[-1 if sign > 0 else 0]
-    reach = sign * (sure.background - end) + height_of(sure, guess.sigma_px)
+    reach = sign * (sure.background - end) + height
     farthest = float(np.quantile(reach, _FARTHEST))
     sure = sure.rows(reach > _FAR * farthest)
     sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])

@@ -73,6 +73,19 @@ class NoiseModel:
             return replace(self, level=np.append(self.level, level), variance=np.append(self.variance, beyond))
         return replace(self, level=np.append(level[::-1], self.level), variance=np.append(beyond[::-1], self.variance))
 
+    def before_gap(self, background: float, sign: float, widest: float) -> NoiseModel:
+        """Return the same noise without the values beyond a gap wider than this, seen from a background upwards or downwards.
+
+        Shutters and margins are as dark as marks, or darker, and have a noise of their own: between them and the film nothing is known.
+        """
+        ahead = np.flatnonzero(sign * (self.level - background) > 0)[:: int(sign)]
+        steps = np.abs(np.diff(np.append(background, self.level[ahead])))
+        wide = np.flatnonzero(steps > widest)
+        if not len(wide) or len(ahead) - wide[0] == len(self.level):
+            return self
+        kept = np.setdiff1d(np.arange(len(self.level)), ahead[wide[0] :])
+        return replace(self, level=self.level[kept], variance=self.variance[kept])
+
     def scatter(self, pixels: Float) -> Float:
         """Return the standard deviation of the mean square of the noise in so many pixels beside each other, in units of the variance.
 

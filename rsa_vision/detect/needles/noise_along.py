@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter, shift
 
-from rsa_vision.detect.balls.leftover import carried_to, worth_it
+from rsa_vision.detect.balls.leftover import WIDE, carried_to, worth_it
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.needles import NeedleFit, arm_images
@@ -65,8 +65,10 @@ def noise_under_needles(film: NDArray[Any], fits: list[NeedleFit], optics: Optic
     if not fits:
         return noise
     sign = float(np.sign(fits[0].depth))
+    background, height = np.array([(f.background, f.height) for f in fits]).T
+    noise = noise.before_gap(sign * float((sign * background).max()), sign, WIDE * float(np.median(height)))
     end = float(noise.level[-1 if sign > 0 else 0])
-    reach = np.array([sign * (f.background - end) + f.height for f in fits])
+    reach = sign * (background - end) + height
     if (farthest := float(np.quantile(reach, _FARTHEST))) <= 0:
         return noise
     arms = [arm for f, far in zip(fits, reach, strict=True) if far > _FAR * farthest for arm in _arms(film, f, optics, noise)]

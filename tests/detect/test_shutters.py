@@ -1,0 +1,53 @@
+"""Shutters: what lies behind them has values and a noise of its own, which says nothing of the noise under marks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from rsa_vision.detect import detect_markers
+from rsa_vision.detect.film.noise import estimate_noise
+from rsa_vision.types import Float
+
+from .films import film_of_balls, grid_of_balls, stored
+
+
+def density_behind_shutters(rng: np.random.Generator) -> tuple[np.ndarray, Float]:
+    """Film of density, with toe and shoulder, of 36 balls in a field with shutters around; the noise is of quanta."""
+    side = 800
+    position, radius = grid_of_balls(rng, 6, 90.0, (2.8, 6.5))
+    position += 90.0
+    exposure = 0.8 * film_of_balls((side, side), position, radius, background=1.0, depth=0.9)
+    slow = gaussian_filter(rng.standard_normal((side, side)), 120, mode="wrap")
+    exposure *= np.exp(0.25 * slow / slow.std())
+    field = np.full((side, side), 0.02)
+    field[90:-90, 100:-80] = 1.0
+    exposure *= gaussian_filter(field, 1.5)
+    exposure = np.maximum(exposure + 0.08 * np.sqrt(exposure) * rng.standard_normal((side, side)), 1e-3)
+    return stored(4095 * (0.08 + 0.84 / (1 + (0.35 / exposure) ** 2)), 12), position
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_ball_is_lost_in_the_field(seed: int) -> None:
+    film, position = density_behind_shutters(np.random.default_rng(seed))
+    found = detect_markers(film, bits=12).images
+    gap = np.hypot(*(position[:, None] - found.position_px).transpose(2, 0, 1))
+    nearest = gap.argmin(axis=1)
+    nearby = zip(position - found.position_px[nearest], found.covariance_px2[nearest], strict=True)
+    z2 = np.array([e @ np.linalg.solve(c, e) for e, c in nearby])
+    there = gap.min(axis=1) < 1.5
+    print(f"{np.count_nonzero(there)} of {len(there)}, error / sd {np.sqrt(z2[there].mean() / 2):.2f}")
+    assert there.all()
+    assert len(found) == len(position)
+
+
+def test_values_beyond_a_gap_are_left_out() -> None:
+    film, _ = density_behind_shutters(np.random.default_rng(0))
+    noise = estimate_noise(film, 12)
+    assert noise.level[0] < 400
+    field = noise.before_gap(2900.0, -1.0, 600.0)
+    assert field.level[0] > 1500
+    assert np.isin(field.level, noise.level).all()
+    assert noise.before_gap(2900.0, -1.0, 1e4) is noise
+    assert noise.before_gap(2900.0, 1.0, 600.0) is noise
