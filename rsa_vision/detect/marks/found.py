@@ -16,6 +16,7 @@ from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import free_places
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.mixed import part
+from rsa_vision.detect.marks.noise_curve import noise_by_value
 from rsa_vision.detect.marks.polarity import Seen, off_pins
 from rsa_vision.detect.marks.resolve import resolve_balls
 from rsa_vision.detect.marks.second_look import look_again
@@ -186,8 +187,12 @@ def _measured(
     reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
     places = free_places(film, known, place, reach, optics, noise)
     free = ~touching & ~found.drawn
-    clear = known.rows(free & (known.valid_fraction > WHOLE) & (known.chi2_ring < STRUCTURE))
-    under = noise_under(clear.chi2_uneven, clear.radius_px, STRUCTURE, places, optics, noise)
+    clear = np.flatnonzero(free & (known.valid_fraction > WHOLE) & (known.chi2_ring < STRUCTURE))
+    under = noise_under(known.chi2_uneven[clear], known.radius_px[clear], STRUCTURE, places, optics, noise)
+    curve = noise_by_value(film, known.rows(clear), lambda i, *at: beside(int(clear[i]), *at), optics, noise)
+    if curve is not None:
+        known = replace(known, covariance=under * known.covariance, chi2_uneven=known.chi2_uneven / under)
+        noise, under = curve, 1.0
     balls, ratio, by_size, covered = settle(film, known, places, under, free, found.edged, beside, optics, noise)
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
         over = painted.under(balls.position_px, balls.radius_px) > _OVER * np.abs(balls.depth)

@@ -1,0 +1,94 @@
+"""The noise under balls by the values that film has there, from what all leave: between toe and shoulder it is highest at their rims."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.fits import BallFits, mirrored, slopes
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.patches import cut
+from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.neighbours.beside import Beside
+from rsa_vision.types import Float
+
+_LEAST = 8  # balls that tell something
+_MOST_PARTS, _PAIRS = 5, 100  # of the values under balls, and pairs of pixels in each
+_UNDER = 0.1  # of full opacity, from which a pixel is under a ball
+_OUTLIER = 25.0  # times the median of the squares, of which noise makes none
+_QUIETEST = 0.3  # of the variance beside them: middles with less would decide where a ball is, by what its model is not exactly
+_NEXT_PX = 2.0  # from the centre, within which a pixel and its opposite share correlated noise
+
+
+def noise_by_value(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> NoiseModel | None:
+    """Return the noise with the values under balls as these tell it.
+
+    Of what fits leave only the odd part counts, which errors of the model do not have, less what the fit of a centre takes up.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    balls : BallFits
+        Clear ones, of one polarity.
+    beside : callable
+        ``beside(i, cols, rows)``: images of the neighbours of ball ``i`` at these pixels, and where they are not to be trusted.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    NoiseModel or None
+        None where too few tell.
+    """
+    if len(balls.depth) < _LEAST:
+        return None
+    told = [_squares(film, balls, i, beside, optics, noise) for i in range(len(balls.depth))]
+    value, square = (np.concatenate(of) for of in zip(*told, strict=True))
+    parts = min(_MOST_PARTS, len(value) // (2 * _PAIRS))
+    if parts < 2:
+        return None
+    order = np.array_split(np.argsort(value), parts)
+    level = np.array([value[these].mean() for these in order])
+    variance = np.array([s[s <= _OUTLIER * np.median(s)].mean() for s in (square[these] for these in order)])
+    least = _QUIETEST * float(np.median(noise.variance_at(balls.background)))
+    return _with_levels(noise, level, np.maximum(variance, least), balls)
+
+
+def _with_levels(noise: NoiseModel, level: Float, variance: Float, balls: BallFits) -> NoiseModel:
+    """Put levels in the place of all on the marks' side of the backgrounds."""
+    sign = np.sign(balls.depth[0])
+    kept = sign * (noise.level - sign * (sign * balls.background).max()) <= 0
+    kept &= sign * (level[0 if sign > 0 else -1] - noise.level) > 0
+    levels, variances = np.append(noise.level[kept], level), np.append(noise.variance[kept], variance)
+    order = np.argsort(levels)
+    return replace(noise, level=levels[order], variance=variances[order])
+
+
+def _squares(film: NDArray[Any], balls: BallFits, i: int, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
+    """Film values expected under a ball, and squares of the noise there, of pixels whose opposites are seen as well."""
+    half = int(np.ceil(balls.radius_px[i] + 3 * optics.sigma_px)) + 1
+    patches = cut(film, balls.position_px[[i]], half, noise)
+    cols, rows = np.meshgrid(*(np.arange(float(patches.size)) + patches.corner_px[0][:, None]))
+    images, doubtful = beside(i, cols, rows)
+    valid = (patches.valid[0] & ~doubtful).reshape(1, -1)
+    dx, dy = (of.reshape(1, -1) - at for of, at in zip((cols, rows), balls.position_px[i], strict=True))
+    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
+    opacity, by_x, by_y, _ = slopes(table, dx, dy, balls.radius_px[[i]], optics.sigma_px)
+    left = (patches.values[0] - images).reshape(1, -1) - balls.depth[i] * opacity
+    expected = balls.background[i] + balls.depth[i] * opacity
+    opposite = mirrored(balls.position_px[[i]] - patches.corner_px, patches.size)
+    pairs = (valid & np.take_along_axis(valid, opposite, 1))[0]
+    odd = (left - np.take_along_axis(left, opposite, 1))[0, pairs] / np.sqrt(2)
+    root = 1 / np.sqrt(noise.variance_at(expected[0, pairs]))
+    basis, _ = np.linalg.qr(np.stack([dx[0, pairs], dy[0, pairs], by_x[0, pairs], by_y[0, pairs]], axis=1) * root[:, None])
+    rest = root * odd
+    rest -= basis @ (basis.T @ rest)
+    # of a pair either half counts; what a fit takes up of one it takes up of the other
+    taken = 2 * np.square(basis).sum(axis=1)
+    under = opacity[0, pairs] > _UNDER
+    if not noise.is_white:
+        under &= np.hypot(dx, dy)[0, pairs] > _NEXT_PX
+    return expected[0, pairs][under], (np.square(rest / root) / np.maximum(1 - taken, 0.2))[under]
