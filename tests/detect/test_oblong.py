@@ -62,3 +62,21 @@ def test_two_much_nearer_than_half_a_diameter_are_told_by_size_and_outline_toget
     print(f"{far} of {doubles} without a flag; {flagged} single balls flagged")
     assert far <= 0.05 * doubles
     assert flagged <= 0.01 * FILMS * 81
+
+
+def test_a_quarter_of_a_diameter_apart_among_balls_of_other_sizes_where_hardly_any_noise_hides_it() -> None:
+    """Neither larger than others nor much longer than wide: it was one ball, fifty standard deviations off either."""
+    rng = np.random.default_rng(3)
+    truth, radius = grid_of_balls(rng, 6, CELL, (3.5, 5.5))
+    double = np.arange(len(truth)) % 9 == 4
+    angle = rng.uniform(0, 2 * np.pi, len(truth))
+    second = (truth + 0.5 * radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))[double]
+    light, other = (
+        film_of_balls((400, 400), at, of, background=1.0, depth=0.6, sigma_px=1.2) for at, of in ((truth, radius), (second, radius[double]))
+    )
+    found = detect_markers(stored(30000 * (light * other + 0.6 / 80 * rng.standard_normal((400, 400)))), bits=16).images
+    nearest = np.hypot(*(truth[:, None] - found.position_px).transpose(2, 0, 1)).argmin(axis=1)
+    flagged = (found.flags != 0)[nearest]
+    print(f"{np.count_nonzero(flagged[double])} of {np.count_nonzero(double)} flagged, {np.count_nonzero(flagged[~double])} of the others")
+    assert flagged[double].all()
+    assert np.count_nonzero(flagged[~double]) <= 1

@@ -24,6 +24,7 @@ _LEAST = 0.08  # of the squared radius, the difference of second moments; two ba
 _LEAST_OF_LARGER, _SURE_OF_LARGER = 0.02, 7.0  # the same of balls larger than the others of the film: that speaks for two as well
 _LARGER, _OF_SPREAD = 0.05, 3.0  # of the logarithm of the radius; of what radii of the film differ by
 _SURE = 14.0  # chi2 with two degrees of freedom: one image in a thousand, if noise makes that much of an outline at all
+_BEYOND_DOUBT, _OF_USUAL = 50.0, 3.0  # the same of smaller ones; times the usual outline of the film
 _AMONG_OTHERS = 3.2  # the same where most images are oblong: one in five
 _MEDIAN = 1.386  # of that
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
@@ -64,6 +65,8 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
     told &= chance > _SURE * usual
     if len(told) >= _LEAST_KNOWN:
         told |= _larger(balls.radius_px) & (chance > _SURE_OF_LARGER * usual) & (length > _LEAST_OF_LARGER)
+        odd = (chance > _BEYOND_DOUBT * usual) & (length > _OF_USUAL * np.median(length))  # where hardly any noise hides an outline
+        told |= odd & (length > _LEAST_OF_LARGER)
     if most or len(told) < _LEAST_KNOWN:
         told |= much
     if most:
