@@ -47,4 +47,5 @@ def test_errors_are_as_stated_and_the_noise_as_it_is(monkeypatch: object) -> Non
     stated = np.sqrt(curves[-1].variance_at(density(levels)))
     print(f"error / sd {ratio:.2f}; noise told over what it is {np.round(stated / truth, 2)}")
     assert 0.85 < ratio < 1.2
-    assert (np.abs(np.log(stated / truth)) < 0.3)[1:].all()  # middles are taken for no quieter than they would decide
+    rims = truth > truth[-1]  # middles are taken for no quieter than what is beside
+    assert (np.abs(np.log(stated / truth)) < 0.3)[rims].all()

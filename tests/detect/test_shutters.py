@@ -46,8 +46,8 @@ def test_values_beyond_a_gap_are_left_out() -> None:
     film, _ = density_behind_shutters(np.random.default_rng(0))
     noise = estimate_noise(film, 12)
     assert noise.level[0] < 400
-    field = noise.before_gap(2900.0, -1.0, 600.0)
+    field = noise.before_gap(3000.0, -1.0, 2500.0)
     assert field.level[0] > 1500
     assert np.isin(field.level, noise.level).all()
-    assert noise.before_gap(2900.0, -1.0, 1e4) is noise
-    assert noise.before_gap(2900.0, 1.0, 600.0) is noise
+    assert noise.before_gap(3000.0, -1.0, 1e4) is noise
+    assert noise.before_gap(3000.0, 1.0, 2500.0) is noise

@@ -31,7 +31,7 @@ _QUARTILE = 0.25  # that tells: what is no ball leaves more
 _MORE = 0.3  # part by which the variance under them is more, that is worth it
 _BY_CHANCE = 4.5  # two standard deviations of that, of one pixel: of odd parts, and neighbours share theirs
 _DOUBLINGS = np.linspace(0.0, 5.0, 21)  # of the variance: hardly anything comes through the middle of a ball where nothing is scattered
-WIDE = 0.3  # of the height of marks: a gap in the values of the film's tiles, beyond which these tell nothing of the noise under marks
+_NEAREST = 0.9  # quantile of the backgrounds towards marks, beyond which odd ones may be
 _FARTHEST, _FAR = 0.75, 0.5  # quantile of how far balls reach beyond the curve, and part of it from which they tell how it goes on
 
 
@@ -62,7 +62,7 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least
         return noise
     guess = guessed_optics(float(np.median(sure.radius_px)))
     sign, height = float(np.sign(sure.depth[0])), height_of(sure, guess.sigma_px)
-    noise = noise.before_gap(sign * float((sign * sure.background).max()), sign, WIDE * float(np.median(height)))
+    noise = noise.before_gap(sign * float(np.quantile(sign * sure.background, _NEAREST)), sign, float(np.quantile(height, _FARTHEST)))
     end = noise.level[-1 if sign > 0 else 0]
     reach = sign * (sure.background - end) + height
     farthest = float(np.quantile(reach, _FARTHEST))

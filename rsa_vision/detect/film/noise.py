@@ -31,6 +31,9 @@ _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is 
 _ROUNDED = 0.1  # of that: less is left by no noise
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
 
+_GAP, _BEYOND_MARKS = 0.5, 0.6  # of the height of marks: a gap in the values of tiles, and how far away what lies behind it has to be
+_LEAST_LEVELS = 4  # this side of it
+
 _NO_LINES = np.zeros(0, np.intp)
 
 
@@ -73,15 +76,15 @@ class NoiseModel:
             return replace(self, level=np.append(self.level, level), variance=np.append(self.variance, beyond))
         return replace(self, level=np.append(level[::-1], self.level), variance=np.append(beyond[::-1], self.variance))
 
-    def before_gap(self, background: float, sign: float, widest: float) -> NoiseModel:
-        """Return the same noise without the values beyond a gap wider than this, seen from a background upwards or downwards.
+    def before_gap(self, background: float, sign: float, height: float) -> NoiseModel:
+        """Return the same noise without the values beyond a gap, where marks of this height on such a background lie in the gap.
 
         Shutters and margins are as dark as marks, or darker, and have a noise of their own: between them and the film nothing is known.
         """
         ahead = np.flatnonzero(sign * (self.level - background) > 0)[:: int(sign)]
-        steps = np.abs(np.diff(np.append(background, self.level[ahead])))
-        wide = np.flatnonzero(steps > widest)
-        if not len(wide) or len(ahead) - wide[0] == len(self.level):
+        away = np.append(0.0, np.abs(self.level[ahead] - background))
+        wide = np.flatnonzero((np.diff(away) > _GAP * height) & (away[1:] > _BEYOND_MARKS * height))
+        if not len(wide) or len(self.level) - len(ahead) + wide[0] < _LEAST_LEVELS:
             return self
         kept = np.setdiff1d(np.arange(len(self.level)), ahead[wide[0] :])
         return replace(self, level=self.level[kept], variance=self.variance[kept])

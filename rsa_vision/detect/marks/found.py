@@ -149,14 +149,8 @@ def _find_balls(
         """Say which are of this polarity, and on no needle."""
         return np.asarray((np.sign(fits.depth) == sign) & ~_on_arms(fits, others))
 
-    away = np.array([np.hypot(*(faint.position_px - n.position_px).T) > _AT_NEEDLES * n.shape.length_px for n in others])
-    beside_needles = faint.rows(away.all(axis=0)) if others else faint
-
     def decided(fits: BallFits) -> Bool:
-        marks = are_balls(fits, limit, optics.sigma_px, noise, mottled=mottled)
-        if marks.any() and not show_what_marks_are_like(fits, limit, optics.sigma_px, noise):
-            marks[marks] = out_of_a_crowd(fits.rows(marks), beside_needles)
-        return marks
+        return are_balls(fits, limit, optics.sigma_px, noise, mottled=mottled)
 
     found = _Balls(*resolve_balls(film, mine, needles.looks, limit, optics, noise, needles.painted))
     found = found.rows(high(found.fits))
@@ -165,6 +159,9 @@ def _find_balls(
     like = decided(join([found.fits, more]))[len(found.fits.depth) :] & bare(more) & high(more)
     # the last fit does not know what was masked either
     found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], drawn=crossed[like])
+    if len(found.fits.depth) and not show_what_marks_are_like(found.fits, limit, optics.sigma_px, noise):
+        away = np.array([np.hypot(*(faint.position_px - n.position_px).T) > _AT_NEEDLES * n.shape.length_px for n in others])
+        found = found.rows(out_of_a_crowd(found.fits, faint.rows(away.all(axis=0)) if others else faint))
     tees = needles.tees
     for fit in needles.doubtful:
         if both := part(film, fit, found.fits, optics, needles.tee_optics, noise, needles.painted or _nothing, is_tee):

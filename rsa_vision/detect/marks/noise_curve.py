@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.fits import BallFits, mirrored, slopes
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
+from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.profiles import Optics, ball_table
 from rsa_vision.detect.neighbours.beside import Beside
 from rsa_vision.types import Float
 
 _LEAST = 8  # balls that tell something
+_QUIET = 1.25  # less variance than this around a ball, in units of the noise, is noise
 _MOST_PARTS, _PAIRS = 5, 100  # of the values under balls, and pairs of pixels in each
 _UNDER = 0.1  # of full opacity, from which a pixel is under a ball
 _OUTLIER = 25.0  # times the median of the squares, of which noise makes none
-_QUIETEST = 0.3  # of the variance beside them: middles with less would decide where a ball is, by what its model is not exactly
+_MORE = 1.5  # times the variance beside them, which is worth a curve
 _NEXT_PX = 2.0  # from the centre, within which a pixel and its opposite share correlated noise
 
 
@@ -41,20 +43,24 @@ def noise_by_value(film: NDArray[Any], balls: BallFits, beside: Beside, optics: 
     Returns
     -------
     NoiseModel or None
-        None where too few tell.
+        None where too few tell, and where there is hardly more noise than beside them.
     """
-    if len(balls.depth) < _LEAST:
+    quiet = np.flatnonzero(balls.chi2_ring < _QUIET)
+    if len(quiet) < _LEAST:
         return None
-    told = [_squares(film, balls, i, beside, optics, noise) for i in range(len(balls.depth))]
+    told = [_squares(film, balls, i, beside, optics, noise) for i in quiet.tolist()]
     value, square = (np.concatenate(of) for of in zip(*told, strict=True))
     parts = min(_MOST_PARTS, len(value) // (2 * _PAIRS))
     if parts < 2:
         return None
     order = np.array_split(np.argsort(value), parts)
     level = np.array([value[these].mean() for these in order])
-    variance = np.array([s[s <= _OUTLIER * np.median(s)].mean() for s in (square[these] for these in order)])
-    least = _QUIETEST * float(np.median(noise.variance_at(balls.background)))
-    return _with_levels(noise, level, np.maximum(variance, least), balls)
+    variance = noise.variance_at(level) * [s[s <= _OUTLIER * np.median(s)].mean() for s in (square[these] for these in order)]
+    beside_them = float(np.median(noise.variance_at(balls.background)))
+    if variance.max() < _MORE * beside_them:
+        return None
+    # middles that are quieter would decide where a ball is, by what its model is not exactly
+    return _with_levels(noise, level, np.maximum(variance, beside_them), balls)
 
 
 def _with_levels(noise: NoiseModel, level: Float, variance: Float, balls: BallFits) -> NoiseModel:
@@ -68,7 +74,7 @@ def _with_levels(noise: NoiseModel, level: Float, variance: Float, balls: BallFi
 
 
 def _squares(film: NDArray[Any], balls: BallFits, i: int, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
-    """Film values expected under a ball, and squares of the noise there, of pixels whose opposites are seen as well."""
+    """Film values expected under a ball, and squares of noise, made white, over what is taken for it; where opposites are seen too."""
     half = int(np.ceil(balls.radius_px[i] + 3 * optics.sigma_px)) + 1
     patches = cut(film, balls.position_px[[i]], half, noise)
     cols, rows = np.meshgrid(*(np.arange(float(patches.size)) + patches.corner_px[0][:, None]))
@@ -80,15 +86,17 @@ def _squares(film: NDArray[Any], balls: BallFits, i: int, beside: Beside, optics
     left = (patches.values[0] - images).reshape(1, -1) - balls.depth[i] * opacity
     expected = balls.background[i] + balls.depth[i] * opacity
     opposite = mirrored(balls.position_px[[i]] - patches.corner_px, patches.size)
-    pairs = (valid & np.take_along_axis(valid, opposite, 1))[0]
-    odd = (left - np.take_along_axis(left, opposite, 1))[0, pairs] / np.sqrt(2)
-    root = 1 / np.sqrt(noise.variance_at(expected[0, pairs]))
-    basis, _ = np.linalg.qr(np.stack([dx[0, pairs], dy[0, pairs], by_x[0, pairs], by_y[0, pairs]], axis=1) * root[:, None])
-    rest = root * odd
-    rest -= basis @ (basis.T @ rest)
-    # of a pair either half counts; what a fit takes up of one it takes up of the other
-    taken = 2 * np.square(basis).sum(axis=1)
-    under = opacity[0, pairs] > _UNDER
+    pairs = valid & np.take_along_axis(valid, opposite, 1)
+    odd = (left - np.take_along_axis(left, opposite, 1)) / np.sqrt(2)
+    root = pairs / np.sqrt(noise.variance_at(expected))
+    # a slope shows more or less under a ball than beside it
+    taken = [dx, dy, dx * opacity, dy * opacity, by_x, by_y]
+    white = whiten_rows(np.concatenate([odd, *taken]) * root, patches.size, noise)
+    basis, _ = np.linalg.qr(white[1:].T)
+    rest = white[0] - basis @ (basis.T @ white[0])
+    under = pairs[0] & (opacity[0] > _UNDER)
     if not noise.is_white:
-        under &= np.hypot(dx, dy)[0, pairs] > _NEXT_PX
-    return expected[0, pairs][under], (np.square(rest / root) / np.maximum(1 - taken, 0.2))[under]
+        under &= np.hypot(dx, dy)[0] > _NEXT_PX
+    # of a pair either half counts; what a fit takes up of one it takes up of the other
+    free = np.maximum(1 - 2 * np.square(basis).sum(axis=1), 0.2)
+    return expected[0, under], (np.square(rest) / free)[under]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter, shift
 
-from rsa_vision.detect.balls.leftover import WIDE, carried_to, worth_it
+from rsa_vision.detect.balls.leftover import carried_to, worth_it
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.needles import NeedleFit, arm_images
@@ -21,6 +21,7 @@ _BODY = 0.2, 0.85  # of the length of an arm: neither the tip nor the thick end,
 _HIGH = 0.4  # of the height of an arm's image: what is under it
 _GAP_PX, _STRIP_PX = 3.0, 8.0  # from an arm to what is beside it; how wide that is
 _LEAST_PIXELS = 12  # under an arm, and beside it
+_NEAREST = 0.9  # as of balls
 _FARTHEST, _FAR = 0.75, 0.5  # quantile of how far needles reach beyond the curve, and part of it from which they tell how it goes on
 _NORMAL = 0.4549  # median of the square of a normal deviate
 
@@ -66,7 +67,7 @@ def noise_under_needles(film: NDArray[Any], fits: list[NeedleFit], optics: Optic
         return noise
     sign = float(np.sign(fits[0].depth))
     background, height = np.array([(f.background, f.height) for f in fits]).T
-    noise = noise.before_gap(sign * float((sign * background).max()), sign, WIDE * float(np.median(height)))
+    noise = noise.before_gap(sign * float(np.quantile(sign * background, _NEAREST)), sign, float(np.quantile(height, _FARTHEST)))
     end = float(noise.level[-1 if sign > 0 else 0])
     reach = sign * (background - end) + height
     if (farthest := float(np.quantile(reach, _FARTHEST))) <= 0:
