@@ -86,7 +86,7 @@ def test_beside_a_letter(place: str) -> None:
 
 
 def test_an_arm_of_which_the_rest_is_hidden_is_no_pin_without_a_flag() -> None:
-    rng = np.random.default_rng(12)
+    rng = np.random.default_rng(13)
     tips = tips_of(rng)
     clear = light_past_tees(tips, np.ones(len(tips)))
     hidden = [5, 10]

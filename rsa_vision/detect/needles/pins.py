@@ -29,7 +29,7 @@ _ROUGH, _STANDS_OUT_ROUGHLY = 0.85, 11.0  # explained by a first look, with gues
 _SIGNIFICANT = 9.0
 _SURER_THAN_ROD = 12.0  # half the chi2 by which a rod must be worse
 _LEAST_OF_A_KIND = 3  # clear pins from which a film is one of pins: others then need less
-_ALONE = 40.0  # significance from which noise may hide the form of fewer: the pins of cage 1A at a contrast of five times the noise
+_ALONE = 5.0  # standard deviations of one pixel: lower ones, of which there are fewer, may be anything as long
 _RATHER_THAN_ROD, _RATHER_THAN_TURNED = 2.5, 7.0
 _ROD = 0.02  # taper of a rod: blunt
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
@@ -223,7 +223,7 @@ def _pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: N
     typical = float(np.median([f.shape.length_px for f in clear[:_SAMPLE]])) if clear else np.nan
     clear = [f for f in clear if _of_a_kind(f, typical)]
     if len(clear) < _LEAST_OF_A_KIND:
-        return [f for f in clear if is_pin(f, noise, _ALONE)]
+        return [f for f in clear if f.height > _ALONE * float(np.sqrt(noise.variance_at(np.array(f.background))))]
     for fit, enough in zip(pins, alone, strict=True):
         if not enough:
             ways = [fit, _refit(film, _turned(fit), optics, noise)]
