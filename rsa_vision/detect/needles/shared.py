@@ -41,7 +41,7 @@ _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much the
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
 _CURVE_ERROR, _TAIL_ERROR = (0.6, 0.1), 0.07
-# of what is uneven of the blur: where nothing tells it, and where balls or the needles themselves have told that it is
+# of what is uneven of the blur: of a first estimate, and where that, or the needles as a whole, have told something of it
 _EVEN_ERROR, _UNEVEN_ERROR = 0.02, 0.2
 _OF_UNEVEN = np.eye(2) / _UNEVEN_ERROR**2
 _BY_CHANCE = 14.0  # chi2 of two degrees of freedom
