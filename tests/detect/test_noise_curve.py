@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import pytest
 
 import rsa_vision.detect.marks.found as found
 from rsa_vision.detect import detect_markers
@@ -18,18 +21,18 @@ def density(exposure: Float) -> Float:
     return 4095 * (0.08 + 0.84 / (1 + (0.35 / exposure) ** 2))
 
 
-def test_errors_are_as_stated_and_the_noise_as_it_is(monkeypatch: object) -> None:
+def test_errors_are_as_stated_and_the_noise_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
     position, radius = grid_of_balls(rng, 8, 70.0, (5.5, 6.5))
     exposure = np.maximum(0.8 * film_of_balls((640, 640), position, radius, background=1.0, depth=0.92), 0.05)
     curves: list[NoiseModel | None] = []
     told = found.noise_by_value
 
-    def listened(*args: object) -> NoiseModel | None:
-        curves.append(told(*args))  # type: ignore[arg-type]
+    def listened(*args: Any) -> NoiseModel | None:
+        curves.append(told(*args))
         return curves[-1]
 
-    monkeypatch.setattr(found, "noise_by_value", listened)  # type: ignore[attr-defined]
+    monkeypatch.setattr(found, "noise_by_value", listened)
     z2 = []
     for _ in range(2):
         film = stored(density(exposure + RELATIVE * np.sqrt(exposure) * rng.standard_normal(exposure.shape)), 12)
