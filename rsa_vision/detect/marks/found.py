@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.crowd import out_of_a_crowd
-from rsa_vision.detect.balls.decide import are_balls, faint_beside, show_what_marks_are_like
+from rsa_vision.detect.balls.decide import are_balls, faint_beside, look_clear, show_what_marks_are_like
 from rsa_vision.detect.balls.find import MISFIT, fit_at, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
@@ -161,7 +161,8 @@ def _find_balls(
     found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], drawn=crossed[like])
     if len(found.fits.depth) and not show_what_marks_are_like(found.fits, limit, optics.sigma_px, noise):
         away = np.array([np.hypot(*(faint.position_px - n.position_px).T) > _AT_NEEDLES * n.shape.length_px for n in others])
-        found = found.rows(out_of_a_crowd(found.fits, faint.rows(away.all(axis=0)) if others else faint))
+        crowd = faint.rows(away.all(axis=0)) if others else faint
+        found = found.rows(look_clear(found.fits, noise) | out_of_a_crowd(found.fits, crowd))
     tees = needles.tees
     for fit in needles.doubtful:
         if both := part(film, fit, found.fits, optics, needles.tee_optics, noise, needles.painted or _nothing, is_tee):
