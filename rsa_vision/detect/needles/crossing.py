@@ -58,13 +58,14 @@ class Window:
 
     def filtered(self, values: Float, through: Filter) -> Float:
         """Filter values at the pixels, in units of the noise, shape (p, n)."""
-        return np.asarray(through(self._boxes(values)).reshape(len(values), -1).take(self.place, axis=1), np.float64)
+        return np.asarray(through(self.boxes(values)).reshape(len(values), -1).take(self.place, axis=1), np.float64)
 
     def covariance(self, influence: Float, noise: NoiseModel) -> Float:
         """Return the covariance of linear functions (p, n) of the film's noise at the pixels."""
-        return influence_covariance(self._boxes(influence), noise.correlation)
+        return influence_covariance(self.boxes(influence), noise.correlation)
 
-    def _boxes(self, values: Float) -> NDArray[np.float32]:
+    def boxes(self, values: Float) -> NDArray[np.float32]:
+        """Return values at the pixels (p, n) as images of the box around them, zero elsewhere."""
         out = np.zeros((len(values), self.box[0] * self.box[1]), np.float32)  # no needle's table is finer than that
         out[:, self.place] = values
         return out.reshape(len(values), *self.box)

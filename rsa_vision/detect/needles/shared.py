@@ -21,8 +21,9 @@ from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window, window_of
+from rsa_vision.detect.needles.disturbed import louder
 from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, SHARED, SLANT, UNEVEN, Equations, by_optics, linearise, own_parameters
-from rsa_vision.detect.needles.fits import between, scored
+from rsa_vision.detect.needles.fits import between, excess_of, scored
 from rsa_vision.detect.needles.grounds import errors_by_ground
 from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms, regular, told_by
 from rsa_vision.detect.needles.sets import beside_each, clusters
@@ -173,8 +174,10 @@ def fit_shared(
     for window, e, members, scatter in zip(windows, systems, at.sets, by_noise, strict=True):
         out += _finished(window, e, members, under * scatter, of_common, optics, noise, converged)
     tips = [scatter[: len(e.tips), : len(e.tips)] for scatter, e in zip(by_noise, systems, strict=True)]
-    by_ground = np.concatenate(errors_by_ground(film, windows, systems, tips, out, through))
-    return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, by_ground, strict=True)], optics
+    by_ground = errors_by_ground(film, windows, systems, tips, out, through)
+    over = [louder(w, e, own, change, optics.sigma_px) for w, e, own in zip(windows, systems, step.own, strict=True)]
+    more = _more(out, np.concatenate(by_ground), tips, over, noise)
+    return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, more, strict=True)], optics
 
 
 def _change(normal: Float, target: Float, taper: float) -> Float:
@@ -359,4 +362,18 @@ def _finished(
         at = slice(2 * i, 2 * i + 2)
         fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
         out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance, window.hidden, optics))
+    return out
+
+
+def _more(needles: list[NeedleFit], by_ground: Float, by_noise: list[Float], over: list[float], noise: NoiseModel) -> Float:
+    """Covariances (n, 2, 2) by what else lies over needles: what the film beside them promises, or what their fits leave if that is more.
+
+    ``by_noise``: covariances of the tips of each window; ``over``: what to multiply them by.
+    """
+    out = by_ground.copy()
+    each = [(matrix[i : i + 2, i : i + 2], times) for matrix, times in zip(by_noise, over, strict=True) for i in range(0, len(matrix), 2)]
+    for k, (own, times) in enumerate(each):
+        left = max(times / excess_of(needles[k], noise) - 1.0, 0.0) * own  # by the excess the table widens all of it
+        if np.trace(left) > np.trace(out[k]):
+            out[k] = left
     return out

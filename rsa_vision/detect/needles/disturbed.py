@@ -1,0 +1,57 @@
+"""What else than noise lies over pins and tees: wires, edges, bone, told by what their fits leave that is as smooth as images are.
+
+A fit takes up of whatever lies over a mark the part that looks like a change of its own numbers, and leaves the rest. Both are as smooth
+as blur makes everything on a film, so that what is left of so few frequencies tells how much has been taken up: the variance that a tip
+responds to is that of these frequencies, not that of single pixels, among which a faint wire is lost.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.needles.crossing import Window
+from rsa_vision.detect.needles.equations import Equations
+from rsa_vision.types import Float
+
+_SURE = 4.0  # standard deviations of what noise alone leaves
+
+
+def louder(window: Window, e: Equations, own: Float, common: Float, sigma_px: float) -> float:
+    """Return the variance of what lies over needles in the frequencies of their images, in units of that of noise; one where it is noise.
+
+    Parameters
+    ----------
+    window : Window
+    e : Equations
+        Of this window, filtered.
+    own, common : ndarray of shape (p,), (c,)
+        Last changes of its own parameters and of the common ones.
+    sigma_px : float
+        Blur of the film.
+
+    Returns
+    -------
+    float
+    """
+    left = e.residual - own @ e.own - common @ e.common
+    square = float(np.square(_smooth(window, left[None], sigma_px)).sum())
+    # what noise comes to: the squares of the weights with which a pixel's surroundings enter it, those within the window
+    kept = 1 / (4 * np.pi * sigma_px**2)
+    expected = kept * float(_smooth(window, np.ones((1, len(left))), sigma_px / np.sqrt(2)).sum())
+    if square < expected:
+        return 1.0
+    smooth = _smooth(window, e.own, sigma_px)
+    expected -= float((e.inverse * (smooth @ smooth.T)).sum())  # fits take up a part of it
+    if expected <= 0:
+        return 1.0
+    ratio = square / expected
+    # as many independent values as the squares of what neighbours share leave of the pixels
+    return ratio if ratio > 1 + _SURE * np.sqrt(4 * np.pi * sigma_px**2 * kept / expected) else 1.0
+
+
+def _smooth(window: Window, values: Float, sigma_px: float) -> NDArray[np.float32]:
+    """Blur values at the pixels of a window, shape (p, n)."""
+    boxes = [cv2.GaussianBlur(box, (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT) for box in window.boxes(values)]
+    return np.asarray(boxes).reshape(len(boxes), -1).take(window.place, axis=1)
