@@ -51,7 +51,7 @@ def detect(
     SettingsError
         If the response is unknown.
     UsageError
-        If no image is given, or a result cannot be written.
+        If no image is given, or a result cannot be written or would take the place of a film or of another result.
     """
     from rsa_vision.detect import detect_markers
     from rsa_vision.images import read_film
@@ -62,6 +62,7 @@ def detect(
         raise UsageError("no image given; name the films to look at")
     settle(None, {"response": response})  # refuses an unknown one
     drawings = [] if overlay is None else _overlay_paths(Path(overlay), [Path(name) for name in images])
+    _check_targets(([] if out is None else [Path(out)]) + drawings, [Path(name) for name in images])
     rows: list[dict[str, Any]] = []
     for number, name in enumerate(images):
         try:
@@ -92,3 +93,17 @@ def _overlay_paths(overlay: Path, images: Sequence[Path]) -> list[Path]:
     stems = [f"{overlay.stem}_{image.stem}" for image in images]
     numbers = [f"_{stems[:k].count(stem) + 1}" if stems.count(stem) > 1 else "" for k, stem in enumerate(stems)]
     return [overlay.with_name(f"{stem}{number}{overlay.suffix or '.png'}") for stem, number in zip(stems, numbers, strict=True)]
+
+
+def _check_targets(targets: Sequence[Path], images: Sequence[Path]) -> None:
+    """Refuse, before any work is done, results that would take the place of a film, of each other or of a folder."""
+    films, taken = {image.resolve() for image in images}, set[Path]()
+    for target in targets:
+        place = target.resolve()
+        if place in films:
+            raise UsageError(f"{target}: is one of the films, which the result would overwrite; choose another name")
+        if place in taken:
+            raise UsageError(f"{target}: two results of one name; choose another for the drawing")
+        if place.is_dir():
+            raise UsageError(f"{target}: is a folder; name a file in it")
+        taken.add(place)

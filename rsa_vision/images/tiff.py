@@ -54,6 +54,8 @@ def _film_page(file: Any, path: Path) -> Any:
     """Return the only full page of a file, or refuse it."""
     full = [page for page in (file.pages[index] for index in range(len(file.pages))) if not int(page.subfiletype) & _REDUCED]
     layers = max((int((file.imagej_metadata or {}).get("images", 1)), *(page.imagedepth for page in full)), default=0)
+    if not full:
+        raise FilmError(f"{path}: no image in it; the file is truncated, copy it again")
     if len(full) != 1 or layers != 1:
         raise FilmFormatError(f"{path}: a stack of {max(len(full), layers)} images; export one film a file")
     page = full[0]

@@ -68,6 +68,21 @@ def test_detect_writes_the_published_columns(folder: Path, tmp_path: Path, capsy
         assert abs(cols.mean() + 50 - 100.25) < 2
 
 
+@pytest.mark.parametrize(
+    ("out", "overlay"), [("film", None), ("found.csv", "film"), ("found.csv", "found.csv"), (".", None)], ids=["-o", "--overlay", "both", "."]
+)
+def test_detect_overwrites_nothing(
+    out: str, overlay: str | None, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    film = sorted(folder.glob("*_f1.tif"))[0]
+    before = film.read_bytes()
+    named = [str(film if name == "film" else tmp_path / name) for name in (out, overlay) if name is not None]
+    assert run_app(["detect", str(film), "-o", named[0], *(["--overlay", named[1]] if overlay else [])]) == 2
+    assert named[-1] in capsys.readouterr().err
+    assert film.read_bytes() == before
+    assert not (tmp_path / "found.csv").exists()
+
+
 @pytest.mark.usefixtures("two_images")
 def test_detect_goes_on_after_a_bad_film(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     film, bad = next(folder.glob("*.tif")), tmp_path / "bad.tif"
