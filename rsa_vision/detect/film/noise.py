@@ -18,6 +18,7 @@ TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surfa
 ENOUGH_TILES = 12  # that are nowhere saturated
 MARKS = 1.8  # times as much as that, and it is not even noise and texture
 STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, and with this power of the value
+_STRUCTURE = 8.0  # times as much variance as film of its fine noise has elsewhere: tiles of such a class lie on edges
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
 _MOST_LOOKED_AT = 1500**2  # pixels that tell whether a film is saturated
@@ -163,7 +164,7 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     """Estimate the noise of a film from tiles spread over it.
 
     In every tile a quadratic surface is removed. Structure only ever adds variance, so within each class of values the quieter tiles are
-    taken; their bias against the mean is undone with the chi-square quantile, for as many degrees of freedom as the correlation leaves.
+    taken, and classes of which all lie on edges (of a round collimator) left out; their bias against the mean is undone with the chi-square quantile, for as many degrees of freedom as the correlation leaves.
 
     Parameters
     ----------
@@ -194,13 +195,15 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     dof = side * side - basis.shape[1]
     variance = np.einsum("ij,ij->i", rest, rest).astype(np.float64) / dof
     order = np.argsort(mean)
-    level, curve, quiet = [], [], []
+    level, curve, rough, quiet = [], [], [], []
     for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
         chosen = part[np.argsort(variance[part])][: max(3, len(part) // 4)]
         level.append(float(mean[chosen].mean()))
         curve.append(float(np.median(variance[chosen])))
+        rough.append(float(np.median(variance[chosen] / _of_neighbours(flat[chosen], side))))
         quiet.append(chosen)
     ranked = np.argsort(level)
+    ranked = ranked[np.array(rough)[ranked] < _STRUCTURE * np.median(rough)]
     level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], QUANTISATION))
     clean = curve_array >= np.array(curve)[ranked] * 0.999
     chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])
@@ -212,6 +215,13 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
     variance = np.maximum(curve_array / bias, max(QUANTISATION, least))
     return NoiseModel(level_array, variance, correlation, floor, ceiling, repaired_lines(film))
+
+
+def _of_neighbours(flat: NDArray[Any], side: int) -> Float:
+    """Return a figure that goes with the variance of noise in tiles, shape (n,), and that the edges in them hardly change."""
+    tiles = flat.reshape(-1, side, side)[:, ::2].astype(np.float32)
+    bend = np.abs(tiles[:, :, 2:] - 2 * tiles[:, :, 1:-1] + tiles[:, :, :-2])
+    return np.asarray(np.maximum(medians(bend.reshape(len(tiles), -1)) ** 2, QUANTISATION), np.float64)
 
 
 def _lag_zero() -> Float:
