@@ -69,11 +69,11 @@ def test_detect_writes_the_published_columns(folder: Path, tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize(
-    ("out", "overlay"), [("film", None), ("found.csv", "film"), ("found.csv", "found.csv"), (".", None)], ids=["-o", "--overlay", "both", "."]
+    ("out", "overlay"),
+    [("film", None), ("found.csv", "film"), ("found.csv", "found.csv"), (".", None)],
+    ids=["-o", "--overlay", "both", "a folder"],
 )
-def test_detect_overwrites_nothing(
-    out: str, overlay: str | None, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_detect_overwrites_nothing(out: str, overlay: str | None, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     film = sorted(folder.glob("*_f1.tif"))[0]
     before = film.read_bytes()
     named = [str(film if name == "film" else tmp_path / name) for name in (out, overlay) if name is not None]

@@ -139,6 +139,18 @@ def test_sharp_balls_of_which_only_the_rim_is_left_are_found_and_flagged(radius_
     measured(film, truth, bright=bright, flag=MarkerFlag.CLIPPED)
 
 
+@pytest.mark.parametrize(("radius_px", "noise", "logarithm", "part"), [(8.0, 0.01, False, 0.2), (6.0, 0.02, True, 0.4)])
+def test_cut_off_balls_are_evidence_for_their_polarity(radius_px: float, noise: float, logarithm: bool, part: float) -> None:
+    """Only whole balls were, and gaps between them that look like three arms that meet decided for the other one: all were lost."""
+    rng = np.random.default_rng(5)
+    truth, radius = grid_of_balls(rng, 4, 7 * radius_px, (0.97 * radius_px, 1.03 * radius_px))
+    side = round(32 * radius_px)
+    exposure = film_of_balls((side, side), truth, radius, background=1.0, depth=0.97, sigma_px=1.0)
+    exposure = exposure + noise * np.sqrt(np.maximum(exposure, 0.0)) * rng.standard_normal(exposure.shape)
+    film = 1 + np.log(np.maximum(exposure, 1e-3)) / 4 if logarithm else exposure
+    measured(32000 * np.maximum(film - part, 0.0) / (1 - part), truth, bright=False, flag=MarkerFlag.CLIPPED)
+
+
 @pytest.mark.parametrize("noise_blur_px", [0.0, 0.6])
 @pytest.mark.parametrize("radius_px", [8.0])
 def test_large_balls_with_much_more_noise_than_beside_them_are_found(radius_px: float, noise_blur_px: float) -> None:

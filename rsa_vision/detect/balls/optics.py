@@ -47,13 +47,15 @@ _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is r
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
 _MUCH_MORE = 1.5  # times the variance
 CAP = 50.0  # significance beyond which a mark is no better evidence
+OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
 
 
 def ball_evidence(fits: BallFits, noise: NoiseModel) -> float:
     """Return how much the fits speak for balls: significances, weighted by how closely the model describes each."""
     rest = np.maximum(misfit(fits, noise) / MISFIT, (1 - fits.explained) / (1 - EXPLAINED))
     whole = (fits.valid_fraction > 0.95) & (fits.window_fraction > 0.8)
-    return float((np.minimum(fits.significance, CAP) * np.exp(-((rest / _SHARP) ** 2)))[whole].sum())
+    say = np.where(whole, 1.0, OF_CUT_OFF)
+    return float(say @ (np.minimum(fits.significance, CAP) * np.exp(-((rest / _SHARP) ** 2))))
 
 
 def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> tuple[Optics, float]:

@@ -164,7 +164,8 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     """Estimate the noise of a film from tiles spread over it.
 
     In every tile a quadratic surface is removed. Structure only ever adds variance, so within each class of values the quieter tiles are
-    taken, and classes of which all lie on edges (of a round collimator) left out; their bias against the mean is undone with the chi-square quantile, for as many degrees of freedom as the correlation leaves.
+    taken, and classes of which all lie on edges (of a round collimator) left out; their bias against the mean is undone with the chi-square
+    quantile, for as many degrees of freedom as the correlation leaves.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.decide import EDGE, height_of
 from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, MISFIT, misfit
 from rsa_vision.detect.balls.fits import BallFits, radii
-from rsa_vision.detect.balls.optics import CAP
+from rsa_vision.detect.balls.optics import CAP, OF_CUT_OFF
 from rsa_vision.detect.balls.unlike import COMPANY, of_odd_size, too_pale
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.resolve import doubt_of_number
@@ -31,7 +31,6 @@ _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, h
 _UNLIKE = 2.0  # times the misfit that is usual on the film
 _FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these may be what is seen of a tee; radians
 _ROOM = 2.0  # standard deviations: nearer to an end of the range the mean of what is left of the noise is not that of the film
-_OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: plateaus have rims as well
 
 
 def what_is_left(balls: BallFits, usual: float, sigma_px: float, noise: NoiseModel) -> tuple[Float, Bool]:
@@ -138,7 +137,7 @@ def table_of(
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
     # of what is small against the blur hardly any of its depth is seen
     high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
-    trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (_OF_CUT_OFF, 1.0)))
+    trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
 
 
