@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rsa_vision.detect import Detection, detect_markers
+from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.flags import MarkerFlag
 
 from .films import ATTENUATION, film_of_balls, grid_of_balls, stored
@@ -206,3 +207,20 @@ def test_balls_beside_the_margin_of_a_scan_are_found(bright: bool) -> None:
     error = (found.images.position_px[index] - truth)[clear]
     chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.images.covariance_px2[index][clear]), error)
     assert chi2.max() < 19.3
+
+
+def test_noise_between_crowded_balls() -> None:
+    """No tile of 32 pixels has room between them: noise was taken for a hundred times what it is, and one in twenty was lost."""
+    rng = np.random.default_rng(1)
+    truth, radius = grid_of_balls(rng, 14, 20.0, (4.0, 4.0))
+    film = film_of_balls((310, 310), truth, radius, background=20000.0, depth=0.9, sigma_px=1.1, noise_sd=400.0, rng=rng)
+    noise = estimate_noise(stored(film), 16)
+    assert 0.7 < noise.variance_at(np.array(20000.0)) / 400.0**2 < 1.5
+    found = detect_markers(stored(film), bits=16)
+    index, _ = nearest(truth, found)
+    assert len(found.images) == len(truth)
+    assert len(set(index.tolist())) == len(truth)
+    error = found.images.position_px[index] - truth
+    ratio = np.sqrt(np.mean(error**2 / np.einsum("nii->ni", found.images.covariance_px2[index])))
+    print(f"RMS {np.sqrt(np.mean(error**2)):.4f} px, error / sd {ratio:.2f}")
+    assert 0.8 < ratio < 1.25

@@ -18,6 +18,9 @@ TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surfa
 ENOUGH_TILES = 12  # that are nowhere saturated
 MARKS = 1.8  # times as much as that, and it is not even noise and texture
 STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, and with this power of the value
+_OF_WHITE = 0.37  # roughness of white noise
+_CROWDED, _ONE_SIDED = 3.0, 0.5  # roughness and skewness of a film's tiles from which marks fill them, and smaller ones are asked
+_EVEN = 0.6  # roughness of the quietest of these up to which they tell
 _STRUCTURE = 8.0  # times as much variance as film of its fine noise has elsewhere: tiles of such a class lie on edges
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
@@ -177,34 +180,30 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     NoiseModel
     """
     floor, ceiling = saturation(film, bits)
+    sides = [TILE, TILE // 2, TILE // 4]  # a small field with shutters around has no room for large ones
     tiles = np.zeros((0, TILE, TILE))
-    for side in (TILE, TILE // 2, TILE // 4):  # a small field with shutters around has no room for large ones
-        tiles = _tiles(film, min(side, *film.shape))
-        whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
-        if np.count_nonzero(whole) >= ENOUGH_TILES:
+    while sides and len(tiles) < ENOUGH_TILES:
+        tiles = _whole_tiles(film, min(sides.pop(0), *film.shape), floor, ceiling)
+    mean, rest, variance = _without_surfaces(tiles)
+    while sides and np.median(_roughness(tiles, variance)) > _CROWDED and abs(np.median(_skewness(rest))) > _ONE_SIDED:
+        smaller = _whole_tiles(film, min(sides.pop(0), *film.shape), floor, ceiling)
+        of_smaller = _without_surfaces(smaller)
+        between = np.argsort(of_smaller[2])[: max(ENOUGH_TILES, len(smaller) // 8)]
+        if np.median(_roughness(smaller[between], of_smaller[2][between])) < _EVEN:
+            tiles, (mean, rest, variance) = smaller, of_smaller  # between crowded marks there is no room for large ones either
             break
-    tiles = tiles[whole] if whole.any() else tiles
     side = tiles.shape[1]
-    axis = np.linspace(-1, 1, side)
-    gx, gy = np.meshgrid(axis, axis)
-    basis = np.linalg.qr(np.stack([b.ravel() for b in (np.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy)], axis=1))[0]
-    flat = tiles.reshape(len(tiles), -1)
-    mean = medians(flat)  # a mark in a tile must not make it a level of its own
-    rest = flat.astype(np.float32) - mean[:, None].astype(np.float32)  # single precision does once the level is off
-    single = basis.astype(np.float32)
-    rest -= (rest @ single) @ single.T
-    dof = side * side - basis.shape[1]
-    variance = np.einsum("ij,ij->i", rest, rest).astype(np.float64) / dof
+    dof = side * side - 6
     order = np.argsort(mean)
     level, curve, rough, quiet = [], [], [], []
     for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
         chosen = part[np.argsort(variance[part])][: max(3, len(part) // 4)]
         level.append(float(mean[chosen].mean()))
         curve.append(float(np.median(variance[chosen])))
-        rough.append(float(np.median(variance[chosen] / _of_neighbours(flat[chosen], side))))
+        rough.append(float(np.median(_roughness(tiles[chosen], variance[chosen]))))
         quiet.append(chosen)
     ranked = np.argsort(level)
-    ranked = ranked[np.array(rough)[ranked] < _STRUCTURE * np.median(rough)]
+    ranked = ranked[np.array(rough)[ranked] < _STRUCTURE * max(min(rough), _OF_WHITE)]
     level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], QUANTISATION))
     clean = curve_array >= np.array(curve)[ranked] * 0.999
     chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])
@@ -218,11 +217,37 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     return NoiseModel(level_array, variance, correlation, floor, ceiling, repaired_lines(film))
 
 
-def _of_neighbours(flat: NDArray[Any], side: int) -> Float:
-    """Return a figure that goes with the variance of noise in tiles, shape (n,), and that the edges in them hardly change."""
-    tiles = flat.reshape(-1, side, side)[:, ::2].astype(np.float32)
-    bend = np.abs(tiles[:, :, 2:] - 2 * tiles[:, :, 1:-1] + tiles[:, :, :-2])
-    return np.asarray(np.maximum(medians(bend.reshape(len(tiles), -1)) ** 2, QUANTISATION), np.float64)
+def _whole_tiles(film: NDArray[Any], side: int, floor: float, ceiling: float) -> NDArray[Any]:
+    """Tiles that are nowhere saturated, shape (n, side, side); all where there is none."""
+    tiles = _tiles(film, side)
+    whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
+    return tiles[whole] if whole.any() else tiles
+
+
+def _without_surfaces(tiles: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], Float]:
+    """Medians of tiles (n,), what quadratic surfaces leave of them (n, p) and its variance (n,)."""
+    axis = np.linspace(-1, 1, tiles.shape[1])
+    gx, gy = np.meshgrid(axis, axis)
+    basis = np.linalg.qr(np.stack([b.ravel() for b in (np.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy)], axis=1))[0]
+    flat = tiles.reshape(len(tiles), -1)
+    mean = medians(flat)  # a mark in a tile must not make it a level of its own
+    rest = flat.astype(np.float32) - mean[:, None].astype(np.float32)  # single precision does once the level is off
+    single = basis.astype(np.float32)
+    rest -= (rest @ single) @ single.T
+    return mean, rest, np.einsum("ij,ij->i", rest, rest).astype(np.float64) / (flat.shape[1] - basis.shape[1])
+
+
+def _roughness(tiles: NDArray[Any], variance: Float) -> Float:
+    """Variance of tiles over what second differences, which edges in them hardly change, make of it, shape (n,)."""
+    some = tiles[:, ::2].astype(np.float32)
+    bend = np.abs(some[:, :, 2:] - 2 * some[:, :, 1:-1] + some[:, :, :-2])
+    return np.asarray(variance / np.maximum(medians(bend.reshape(len(tiles), -1)) ** 2, QUANTISATION), np.float64)
+
+
+def _skewness(rest: NDArray[Any]) -> Float:
+    """Skewness of what surfaces leave of tiles (n, p): marks are all darker, or all brighter, than what is between them."""
+    spread = np.sqrt(np.mean(np.square(rest), axis=1, dtype=np.float64))
+    return np.asarray(np.mean(rest**3, axis=1, dtype=np.float64) / np.maximum(spread, 1e-9) ** 3)
 
 
 def _lag_zero() -> Float:
