@@ -21,7 +21,7 @@ from rsa_vision.detect.needles.noise_along import noise_under_needles
 from rsa_vision.detect.needles.pins import is_slim, look_for_pins, on_pins, optics_of_pins
 from rsa_vision.detect.needles.tees import GUESS, first_tees, optics_of_tees
 from rsa_vision.detect.search.candidates import Candidates
-from rsa_vision.types import Float
+from rsa_vision.types import Bool, Float
 
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _STRONGEST = 100  # candidates of each polarity that are looked at first
@@ -30,6 +30,7 @@ _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _RIVAL = 0.25  # of the evidence of the better polarity, from which the other is looked at as well
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: of marks it has next to none
+_REACH = 3.0  # of the radius of the ring on which a junction's arms are seen, that these reach
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
 
@@ -131,6 +132,12 @@ def _of_tees(candidates: Candidates, sign: int) -> float:
     return float(np.clip(-sign * candidates.junctions[:, 4] - CLEAR_JUNCTION, 0.0, 20.0).sum())
 
 
+def _at_junctions(position_px: Float, junctions: Float) -> Bool:
+    """Say which places may lie on the arms of tees."""
+    gap = np.hypot(*(position_px[:, None] - junctions[:, :2]).transpose(2, 0, 1))
+    return np.asarray((gap < _REACH * junctions[:, 3]).any(axis=1))
+
+
 def _of_arms(strokes: Float, sign: int) -> float:
     """The same of strokes at junctions."""
     strength = -sign * STRENGTH * strokes[:, 5]
@@ -173,7 +180,8 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
     junctions = candidates.junctions[-sign * candidates.junctions[:, 4] > 0]
     clear = junctions[np.abs(junctions[:, 4]) > CLEAR_JUNCTION]
     round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
-    under = noise_at_marks(film, looks, noise, *[BESIDE_NEEDLES] * bool(len(clear) or slim))
+    off_tees = looks.rows(~_at_junctions(looks.position_px, clear))  # parts of arms leave what no ball does, and that is no noise
+    under = noise_at_marks(film, off_tees, noise, *[BESIDE_NEEDLES] * bool(len(clear) or slim))
     if under is not noise:  # not all that was unlike a ball in less noise is none
         looks = distinct(_look(film, round_ones, pins, under), under)
         looks = looks.rows(~faint_beside(looks, slim, COARSE_SIGMA_PX, under))

@@ -80,6 +80,9 @@ def find_tees(
         return [], [], optics
     if under := _outshone(film, tees, models[0], optics, noise):
         tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=MOST_TOGETHER), models[0])
+    if optics.rough:  # where arms cross hardly depends on where they end; with a wrong blur one tee leaves what two explain
+        optics = common_optics(film, tees, optics, noise)
+        tees = fit_all(film, tees, optics, noise)
     around = tees
 
     def beside(mine: list[NeedleFit]) -> Any:
@@ -89,9 +92,6 @@ def find_tees(
     tees = [t for t in tees if not goes_on(film, t, optics, others_beside(t, [o for o in tees if o is not t], optics))]
     if not tees:
         return [], [], optics
-    if optics.rough:
-        optics = common_optics(film, tees, optics, noise)  # where arms cross hardly depends on where they end
-        tees = fit_all(film, tees, optics, noise)
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     depth, background = (np.array([getattr(t, name) for t in nearly]) for name in ("depth", "background"))
