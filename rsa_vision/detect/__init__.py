@@ -85,7 +85,7 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
     seeds, signs = first_looks(values, candidates, pins, noise)
     found: list[tuple[float, Detection]] = []
     for seen in polarities(values, signs, seeds, pins, candidates, noise):
-        if found and found[0][0] > _BEYOND * seen.weight:
+        if found and found[0][0] > (_BEYOND * seen.weight if seen.rival else 0.0):
             break
         bright = high_balls(seen.looks, seen.noise)
         if len(bright.depth) and not as_it_is:

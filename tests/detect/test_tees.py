@@ -226,3 +226,26 @@ def test_what_is_blotted_out_beside_tees_does_not_tell_what_bone_does_to_them() 
     fitted, _ = shared.fit_shared(bare, found, optics, noise, parallel=True)
     assert len(fitted) == len(tips)
     assert np.isfinite([f.covariance_px2 for f in fitted]).all()
+
+
+@pytest.mark.parametrize(("cnr", "pitch_mm"), [(200.0, 0.058), (50.0, 0.058), (50.0, 0.1)])
+def test_tees_alone_in_little_noise(cnr: float, pitch_mm: float) -> None:
+    """What surrounds them passed for tees of the other polarity, one for two where blur was guessed, misfits of balls for noise."""
+    z2 = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        tips = tips_of(rng)
+        light = gaussian_filter(light_past_tees(tips, np.ones(len(tips)), pitch_mm=pitch_mm), 1.2)
+        noise_sd = 40000 * (1 - light.min()) / cnr
+        film = stored(40000 * light + noise_sd * rng.standard_normal(light.shape))
+        found = detect_markers(film, bits=16)
+        assert found.dark_markers
+        check(found.images, tips, [])
+        noise = found.noise.variance_at(np.array([40000.0, 40000 * light.min()])) / noise_sd**2
+        assert noise.max() < 1.5
+        nearest = np.hypot(*(found.images.position_px - tips[:, None]).transpose(2, 0, 1)).argmin(axis=1)
+        error = found.images.position_px[nearest] - tips
+        z2.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.images.covariance_px2[nearest]), error))
+    ratio = np.sqrt(np.mean(z2) / 2)
+    print(f"CNR {cnr}, pitch {pitch_mm}: error / sd {ratio:.2f}, largest {np.sqrt(np.max(z2)):.1f}")
+    assert 0.7 < ratio < (1.3 if cnr < 100 else 2.0)  # of so little noise samples of a ninth of a pixel are more

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _RIVAL = 0.25  # of the evidence of the better polarity, from which the other is looked at as well
+_PERHAPS = 150.0  # evidence from which it is looked at even so, if the better one has shown none
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: of marks it has next to none
 _REACH = 3.0  # of the radius of the ring on which a junction's arms are seen, that these reach
@@ -49,6 +50,8 @@ class Seen:
         With that at marks of this polarity.
     weight : float
         Evidence for it.
+    rival : bool
+        It is looked at even if the other sign has shown marks.
     """
 
     sign: int
@@ -56,6 +59,7 @@ class Seen:
     optics: Optics
     noise: NoiseModel
     weight: float
+    rival: bool = True
 
 
 def first_looks(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> tuple[BallFits, list[int]]:
@@ -147,7 +151,7 @@ def _of_arms(strokes: Float, sign: int) -> float:
 def polarities(
     film: NDArray[Any], signs: list[int], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel
 ) -> list[Seen]:
-    """Choose the signs of depth worth looking at: both only where neither is clearly the markers'.
+    """Say in which order the signs of depth are worth looking at, and which is one where the other has shown marks.
 
     Parameters
     ----------
@@ -169,8 +173,9 @@ def polarities(
     if seen[best].weight == 0 and len(seeds.depth) == 0:
         return []
     least = _RIVAL * seen[best].weight if seen[best].weight > _LEAST_EVIDENCE else 0.0
-    rivals = [sign for sign in signs if sign == best or seen[sign].weight >= least]
-    return [seen[sign] for sign in sorted(rivals, key=lambda sign: sign != best)]
+    rivals = [replace(seen[sign], rival=sign == best or seen[sign].weight >= least) for sign in signs]
+    # what surrounds marks of hardly any noise answers to the search as well: if there is nothing in it, the marks are the others
+    return sorted([s for s in rivals if s.rival or s.weight > _PERHAPS], key=lambda s: s.sign != best)
 
 
 def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel) -> Seen:
@@ -180,7 +185,8 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
     junctions = candidates.junctions[-sign * candidates.junctions[:, 4] > 0]
     clear = junctions[np.abs(junctions[:, 4]) > CLEAR_JUNCTION]
     round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
-    off_tees = looks.rows(~_at_junctions(looks.position_px, clear))  # parts of arms leave what no ball does, and that is no noise
+    # parts of arms leave what no ball does, and that is no noise
+    off_tees = looks.rows(~_at_junctions(looks.position_px, junctions if len(clear) else clear))
     under = noise_at_marks(film, off_tees, noise, *[BESIDE_NEEDLES] * bool(len(clear) or slim))
     if under is not noise:  # not all that was unlike a ball in less noise is none
         looks = distinct(_look(film, round_ones, pins, under), under)
