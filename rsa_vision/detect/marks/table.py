@@ -22,7 +22,7 @@ from rsa_vision.detect.needles.fits import excess_of, significant_misfit
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
-EXACT_PX = 0.002  # error without any noise: what areas of pixels and rims of marks are rounded to, here and in other programs
+EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 _NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
@@ -123,8 +123,7 @@ def table_of(
     # whatever lies around it, what was found of a ball lies under its image: evenly spread over a disc at worst
     most = 0.25 * (balls.radius_px + optics.sigma_px) ** 2
     covariance[:n] *= np.minimum(1.0, most / np.linalg.eigvalsh(covariance[:n])[:, -1])[:, None, None]
-    covariance += EXACT_PX**2 * np.eye(2)
-    covariance[:n] += doubt_of_number(balls)
+    covariance[:n] += EXACT_PX**2 * np.eye(2) + doubt_of_number(balls)
     lost = np.linalg.eigvalsh(covariance[:n])[:, -1] > (_LOST * balls.radius_px) ** 2
     flags[:n][lost] |= MarkerFlag.POOR_FIT
     flags[n:][np.linalg.eigvalsh(covariance[n:])[:, -1] > (2 * radius[n:]) ** 2] |= MarkerFlag.POOR_FIT
