@@ -23,7 +23,9 @@ from synthetic.scanner import Response, Scanner
 
 Float = NDArray[np.float64]
 
-FINE, FINER = 5, 9  # samples along a pixel: of films, and of the derivatives, where nearly equal ones must be told apart
+# samples along a pixel: of films of balls, of those of pins and tees (of fewer, ends of arms along rows of pixels are 0.01 px off), and of
+# the derivatives, where nearly equal ones must be told apart
+FINE, FINE_ARMS, FINER = 5, 13, 9
 PRIMARY = 0.5  # of the exposure; the rest is scatter, which no marker stops: noise of CNR 5 must not reach the ends of the value range
 TANTALUM_MM = 0.8  # diameter of the balls: their attenuation is 8 per mm at every pitch
 PER_MM = 8.0
@@ -151,7 +153,8 @@ def _binned(image: Float, fine: int) -> Float:
 
 def opacity(case: Case, phase: tuple[float, float], parameters: tuple[float, ...], sigma: float) -> Float:
     """Return the part of the primary exposure that a mark takes away, over pixels whose middle one is (0, 0)."""
-    return _binned(_fine_opacity(case, phase, parameters, sigma, FINE, _reach(case, sigma)), FINE)
+    fine = FINE_ARMS if case.shape in ("pin", "tee") else FINE
+    return _binned(_fine_opacity(case, phase, parameters, sigma, fine, _reach(case, sigma)), fine)
 
 
 @lru_cache(maxsize=256)
