@@ -180,20 +180,25 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     NoiseModel
     """
     floor, ceiling = saturation(film, bits)
-    sides = [TILE, TILE // 2, TILE // 4]  # a small field with shutters around has no room for large ones
+    # a small field with shutters around has no room for large ones
+    sides = [min(side, *film.shape) for side in (TILE, TILE // 2, TILE // 4)]
     tiles = np.zeros((0, TILE, TILE))
     while sides and len(tiles) < ENOUGH_TILES:
-        tiles = _whole_tiles(film, min(sides.pop(0), *film.shape), floor, ceiling)
+        side = sides.pop(0)
+        tiles = _whole_tiles(film, side, floor, ceiling)
+    if not len(tiles):
+        tiles = _tiles(film, side)
     mean, rest, variance = _without_surfaces(tiles)
     while sides and np.median(_roughness(tiles, variance)) > _CROWDED and abs(np.median(_skewness(rest))) > _ONE_SIDED:
-        smaller = _whole_tiles(film, min(sides.pop(0), *film.shape), floor, ceiling)
+        smaller = _whole_tiles(film, sides.pop(0), floor, ceiling)
+        if len(smaller) < ENOUGH_TILES:
+            break
         of_smaller = _without_surfaces(smaller)
-        between = np.argsort(of_smaller[2])[: max(ENOUGH_TILES, len(smaller) // 8)]
+        between = np.argsort(of_smaller[2])[: max(ENOUGH_TILES, len(smaller) // 8)]  # the quietest
         if np.median(_roughness(smaller[between], of_smaller[2][between])) < _EVEN:
             tiles, (mean, rest, variance) = smaller, of_smaller  # between crowded marks there is no room for large ones either
             break
-    side = tiles.shape[1]
-    dof = side * side - 6
+    dof = tiles[0].size - 6  # of the surface
     order = np.argsort(mean)
     level, curve, rough, quiet = [], [], [], []
     for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
@@ -218,10 +223,9 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
 
 
 def _whole_tiles(film: NDArray[Any], side: int, floor: float, ceiling: float) -> NDArray[Any]:
-    """Tiles that are nowhere saturated, shape (n, side, side); all where there is none."""
+    """Tiles that are nowhere saturated, shape (n, side, side)."""
     tiles = _tiles(film, side)
-    whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
-    return tiles[whole] if whole.any() else tiles
+    return np.asarray(tiles[(tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)])
 
 
 def _without_surfaces(tiles: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], Float]:
