@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import faint_beside
+from rsa_vision.detect.balls.decide import CLOSE, faint_beside
 from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, ROUNDNESS, STRENGTH, distinct, first_look
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import BESIDE_NEEDLES, noise_at_marks
@@ -186,8 +186,8 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
     clear = junctions[np.abs(junctions[:, 4]) > CLEAR_JUNCTION]
     round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
     # parts of arms leave what no ball does, and that is no noise
-    off_tees = looks.rows(~_at_junctions(looks.position_px, junctions if len(clear) else clear))
-    under = noise_at_marks(film, off_tees, noise, *[BESIDE_NEEDLES] * bool(len(clear) or slim))
+    arms = _at_junctions(looks.position_px, junctions if len(clear) else clear) & (looks.explained < CLOSE)
+    under = noise_at_marks(film, looks.rows(~arms), noise, *[BESIDE_NEEDLES] * bool(len(clear) or slim))
     if under is not noise:  # not all that was unlike a ball in less noise is none
         looks = distinct(_look(film, round_ones, pins, under), under)
         looks = looks.rows(~faint_beside(looks, slim, COARSE_SIGMA_PX, under))
