@@ -29,13 +29,15 @@ def film_of_pins(
     response: str = "linear",
     tail: float = 0.0,
     unevenly: float = 1.0,
+    penumbra_px: float = 0.0,
 ) -> tuple[np.ndarray, Float, Float]:
     """Sixteen pins of 0.5 x 2 mm in all directions, exact chords; tips and directions away from them, both (n, 2), (col, row).
 
     Every third is ``smaller`` by that factor. ``response``: ``density``, of film with half as much scattered light. ``tail``: part of the
     light that is spread four times as far. ``unevenly``: so many times as far along columns as along rows.
+    ``penumbra_px``: blur that every second pin has besides.
     """
-    clear = np.ones((SIDE, SIDE))
+    clear = np.ones((2, SIDE, SIDE))
     cell, half = SIDE // CELLS, 34
     tips, ways = [], []
     for row, col in np.ndindex(CELLS, CELLS):
@@ -50,11 +52,12 @@ def film_of_pins(
         origin, down = np.array([x * PITCH_MM, y * PITCH_MM, 0 * x]), np.array([0 * x + lean[0], 0 * x + lean[1], 0 * x + 1])
         chord = chord_pin(origin, down, np.zeros(3), np.array([*way, 0.0]), 2.0 * size, 0.25 * size, taper)
         left = np.exp(-MU_PER_MM * chord).reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
-        clear[corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= left
+        clear[len(tips) % 2, corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= left
         tips.append(tip)
         ways.append(way)
     blur = SIGMA_PX * np.sqrt(unevenly), SIGMA_PX / np.sqrt(unevenly)
-    seen = (1 - tail) * gaussian_filter(clear, blur) + tail * gaussian_filter(clear, 4 * SIGMA_PX)
+    light = clear[0] * gaussian_filter(clear[1], penumbra_px)
+    seen = (1 - tail) * gaussian_filter(light, blur) + tail * gaussian_filter(light, 4 * SIGMA_PX)
     counts = rng.poisson(base * seen * quanta) / quanta
     if response == "density":
         counts = 1 / (1 + (DENSE / (counts + 0.5 * base)) ** 2)

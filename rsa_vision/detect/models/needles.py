@@ -28,6 +28,7 @@ GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of t
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
 _LOG_GRID = math.log(GRID)
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
+_BLUR_GRID = 0.002  # of the logarithm of a needle's own blur
 _UNEVEN_GRID = 0.02  # between what is uneven, of the blur of an arm, that has tables of its own
 _PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
@@ -80,6 +81,8 @@ class NeedleFit:
         How the rays cross each thick end, once it has been asked for: the square of their slope along the arm, and the skew of the end.
     height : float
         Largest difference from the background in its image; the depth is what full opacity would come to.
+    blurrier : float
+        Logarithm of its blur over that of the film: the penumbra grows with the distance from the film.
     """
 
     position_px: Float
@@ -99,6 +102,13 @@ class NeedleFit:
     converged: bool
     slants: Float | None = None
     height: float = 0.0
+    blurrier: float = 0.0
+
+    def seen_by(self, optics: Optics) -> Optics:
+        """Return a film's optics with the blur of this needle, on a grid that has tables of its own."""
+        if abs(self.blurrier) < _BLUR_GRID / 2:
+            return optics
+        return replace(optics, sigma_px=optics.sigma_px * math.exp(_BLUR_GRID * round(self.blurrier / _BLUR_GRID)))
 
 
 @lru_cache(maxsize=1024)
@@ -261,7 +271,7 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
     -------
     ndarray of the shape of ``dx``
     """
-    seen = _Seen.of(dx.ravel(), dy.ravel(), fit.angles, fit.shape, optics)
+    seen = _Seen.of(dx.ravel(), dy.ravel(), fit.angles, fit.shape, fit.seen_by(optics))
     values, _ = seen.values(fit.shape, fit.slants, slopes=False)
     image: Float = (fit.depths @ seen.spread([values])[0]).reshape(dx.shape)
     return image

@@ -164,7 +164,7 @@ def fit_crossing(
             tees = tees[:, :1] + np.matmul(_change(before, now)[:, None], tees[:, 1:])
         else:
             offsets = [(cols - f.position_px[0], rows - f.position_px[1]) for f in now]
-            blocks = [arm_images(*at, f.angles, f.shape, optics, slopes=not last) for at, f in zip(offsets, now, strict=True)]
+            blocks = [arm_images(*at, f.angles, f.shape, f.seen_by(optics), slopes=not last) for at, f in zip(offsets, now, strict=True)]
             if optics.proportion:
                 blocks = [block * gain_at(f, ground, optics) for f, block in zip(now, blocks, strict=True)]
             tees = np.array([block.sum(1) for block in blocks])

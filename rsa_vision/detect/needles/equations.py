@@ -17,8 +17,10 @@ from rsa_vision.detect.needles.irregular import ARMS, OF_STRETCH, WAYS, Regulari
 from rsa_vision.types import Float, Int
 
 # common to all: attenuation, blur, taper, curve (2), tail, uneven (2); then logarithms of half width and length; then directions
-UNEVEN = slice(6, 8)
+BENT, UNEVEN = slice(3, 8), slice(6, 8)
 OPTICS, SHARED = 8, 10
+OWN = 5  # tip (2), half width, length, blur; then directions, slants, and how arms differ
+_BLUR = 1  # place of its logarithm in what is common
 SLANT, SKEW = 0.11, 0.08  # root mean squares, of a square and a product of slopes: rays cross a film at slopes of up to a half
 # slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
 OF_SLANTS = {
@@ -28,6 +30,34 @@ OF_SLANTS = {
 _OF_PRODUCT = 0.1  # of the depth: error of the product of two shadows where they lie over each other
 _CORE = 0.3  # of the largest depth, from which the noise is that under a needle
 _RIDGE = 1e-4  # relative: keeps what the pixels do not determine where it is
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """What is expected of the needles of a window.
+
+    Attributes
+    ----------
+    sizes : ndarray of shape (2,)
+        Logarithms of half width and length that are usual on the film.
+    of_sizes : ndarray of shape (members, 2)
+        How far each may differ from them (standard deviations); infinite where nothing is known.
+    blur : float
+        What is usual of the logarithm of a needle's blur over the film's.
+    of_blur : ndarray of shape (members,)
+        How far each may differ from that.
+    regularity : Regularity, optional
+        Of the arms of tees.
+    of_ways : ndarray of shape (members, 4)
+        Of that, the spread of these.
+    """
+
+    sizes: Float
+    of_sizes: Float
+    blur: float
+    of_blur: Float
+    regularity: Regularity | None
+    of_ways: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,12 +153,22 @@ class Equations:
     def free_ways(self, common: Float) -> tuple[Float, Float]:
         """How far the arms of each tee differ were nothing expected of that, and the squares of the errors, shape (members, 4)."""
         each = own_parameters(ARMS, self.parallel)
-        at = np.add.outer(each * np.arange(len(self.members)), np.arange(each - WAYS, each)).ravel()
+        change, variance = self._free(np.arange(each - WAYS, each))
+        return np.array([ways_of(f, common) for f in self.members]) + change, variance
+
+    def free_blurs(self) -> tuple[Float, Float]:
+        """How far the blur of each differs were nothing expected of that, and the squares of the errors, shape (members,)."""
+        change, variance = self._free(np.array([OWN - 1]))
+        return np.array([f.blurrier for f in self.members]) + change[:, 0], variance[:, 0]
+
+    def _free(self, which: Int) -> tuple[Float, Float]:
+        """Changes of these own parameters of each needle were nothing expected of them, and their variances, shape (members, k)."""
+        each = own_parameters(len(self.members[0].angles), self.parallel)
+        at = np.add.outer(each * np.arange(len(self.members)), which)
         prior = self.prior.copy()
         prior[at] = 0.0
         free = replace(self, prior=prior, known=np.where(prior > 0, self.known, 0.0))
-        ways = np.concatenate([ways_of(f, common) for f in self.members]) + free.own_alone[at]
-        return ways.reshape(-1, WAYS), self.excess * free.inverse.diagonal()[at].reshape(-1, WAYS)
+        return free.own_alone[at], self.excess * free.inverse.diagonal()[at]
 
     @cached_property
     def cost(self) -> float:
@@ -148,10 +188,7 @@ def linearise(
     optics: Optics,
     noise: NoiseModel,
     parallel: bool,
-    typical: Float,
-    spread: Float,
-    regularity: Regularity | None,
-    differs: Float,
+    expected: Expected,
     before: Equations | None,
 ) -> Equations:
     """Linearise the fit of the needles of a window where they are.
@@ -166,14 +203,7 @@ def linearise(
     noise : NoiseModel
     parallel : bool
         The arms of all needles have the same directions against their first.
-    typical : ndarray of shape (2,)
-        Logarithms of half width and length that are usual on the film.
-    spread : ndarray of shape (members, 2)
-        How far each may differ from them (standard deviations); infinite where nothing is known.
-    regularity : Regularity, optional
-        Of the arms of tees.
-    differs : ndarray of shape (members, 4)
-        Of that, the spread of these.
+    expected : Expected
     before : Equations, optional
         Those of the step before: noise and gain go with their background and depths.
 
@@ -190,7 +220,7 @@ def linearise(
         slopes = [s * g for s, g in zip(slopes, gains, strict=True)]
     arms = len(members[0].angles)
     of_slants = OF_SLANTS[arms]
-    expected = np.array([*[SLANT] * (of_slants.shape[1] - 1), SKEW])
+    of_ends = np.array([*[SLANT] * (of_slants.shape[1] - 1), SKEW])
     lapped = lapping([b[0].sum(0) for b in blocks])
     linear = np.concatenate([*(b[0] for b in blocks), *lapped, surface])
     root = np.sqrt(weight)
@@ -203,30 +233,32 @@ def linearise(
     left = window.data - model
     now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
     moves, common, priors, known = [], np.zeros((SHARED + (arms - 1) * parallel, len(weight))), [], []
-    for f, block, slope, of_size, of_ways in zip(now, blocks, slopes, spread, differs, strict=True):
+    of_each = zip(now, blocks, slopes, expected.of_sizes, expected.of_blur, expected.of_ways, strict=True)
+    for f, block, slope, of_size, of_blur, of_ways in of_each:
         size = np.array([f.shape.half_width_px, f.shape.length_px])
-        by_tip_and_size = f.depths @ block[1:5]
+        by_tip_and_size, by_common = f.depths @ block[1:5], f.depths @ slope
         turns = f.depths[:, None] * block[5]
         slants = np.zeros((2, arms)) if f.slants is None else f.slants
         by_ends = (f.depths[:, None] * block[6:]).reshape(2 * arms, -1)
-        moves += [by_tip_and_size, turns.sum(0, keepdims=True) if parallel else turns, of_slants.T @ by_ends]
-        common[:OPTICS] += f.depths @ slope
+        moves += [by_tip_and_size, by_common[_BLUR, None], turns.sum(0, keepdims=True) if parallel else turns, of_slants.T @ by_ends]
+        common[:OPTICS] += by_common
         common[OPTICS:SHARED] += size[:, None] * by_tip_and_size[2:]
         if parallel:
             common[SHARED:] += turns[1:]
         turning = np.zeros(1 if parallel else arms)
-        priors += [np.zeros(2), 1 / (of_size * size), turning, 1 / expected]
+        priors += [np.zeros(2), 1 / (of_size * size), np.array([1 / of_blur]), turning, 1 / of_ends]
         known += [
             np.zeros(2),
-            (typical - np.log(size)) / of_size,
+            (expected.sizes - np.log(size)) / of_size,
+            np.array([(expected.blur - f.blurrier) / of_blur]),
             turning,
-            -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / expected,
+            -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / of_ends,
         ]
-        if regularity is not None:
+        if expected.regularity is not None:
             ways = slice(0 if parallel else 2, None)
             moves += [turns[1:]] * parallel + [OF_STRETCH.T @ (size[1] * f.depths[:, None] * block[4])]
             priors.append(1 / of_ways[ways])
-            known.append((regularity.typical - ways_of(f, regularity.common))[ways] / of_ways[ways])
+            known.append((expected.regularity.typical - ways_of(f, expected.regularity.common))[ways] / of_ways[ways])
     rows = np.concatenate([*moves, linear, common]) * root
     p, rest = len(rows) - len(common), np.zeros(len(linear))
     return Equations(
@@ -248,16 +280,18 @@ def linearise(
 
 
 def own_parameters(arms: int, parallel: bool) -> int:
-    """Count tip (2), half width, length, one or all directions, what the ends have, how arms differ; the depths are linear."""
-    return 4 + (1 if parallel else arms) + int(OF_SLANTS[arms].shape[1]) + (0 if arms == 1 else WAYS if parallel else WAYS - 2)
+    """Count tip, size and blur, one or all directions, what the ends have, how arms differ; the depths are linear."""
+    return OWN + (1 if parallel else arms) + int(OF_SLANTS[arms].shape[1]) + (0 if arms == 1 else WAYS if parallel else WAYS - 2)
 
 
 def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
     slants = np.zeros((2, len(fit.angles))) if fit.slants is None else fit.slants
-    return arm_images(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit.angles, fit.shape, optics, slants)
+    return arm_images(
+        window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit.angles, fit.shape, fit.seen_by(optics), slants
+    )
 
 
 def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
     """Derivatives of each member's arms by what is common, shape (8, k, n), as of :func:`arms_by_optics`."""
     offsets = [(window.cols - f.position_px[0], window.rows - f.position_px[1]) for f in members]
-    return [arms_by_optics(*at, f.angles, f.shape, optics) for at, f in zip(offsets, members, strict=True)]
+    return [arms_by_optics(*at, f.angles, f.shape, f.seen_by(optics)) for at, f in zip(offsets, members, strict=True)]

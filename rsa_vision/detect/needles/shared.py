@@ -22,10 +22,25 @@ from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window, window_of
 from rsa_vision.detect.needles.disturbed import louder
-from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, SHARED, SLANT, UNEVEN, Equations, by_optics, linearise, own_parameters
+from rsa_vision.detect.needles.equations import (
+    BENT,
+    OF_SLANTS,
+    OPTICS,
+    OWN,
+    SHARED,
+    SLANT,
+    UNEVEN,
+    Equations,
+    Expected,
+    by_optics,
+    linearise,
+    own_parameters,
+)
 from rsa_vision.detect.needles.fits import between, excess_of, scored
 from rsa_vision.detect.needles.grounds import errors_by_ground
 from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms, regular, told_by
+from rsa_vision.detect.needles.penumbra import MOST as MOST_BLURRIER
+from rsa_vision.detect.needles.penumbra import Blurs, differing, equal
 from rsa_vision.detect.needles.sets import beside_each, clusters
 from rsa_vision.types import Float
 
@@ -37,7 +52,8 @@ _FINEST_PX = 0.02  # added to those, for the tables are interpolated
 _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
 _TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
 _SIZE_ERROR = 1.0  # of those, before
-_ASKED_AFTER = 4  # steps, after which it is asked at the latest how far arms differ: what differs does not converge
+_ASKED_AFTER = 4  # steps, after which it is asked at the latest how far arms and blurs differ: what differs does not converge
+_BLURS_AFTER, _MORE_STEPS = 3, 6
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
@@ -52,6 +68,7 @@ _NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.1])  # changes of those w
 _MOST = 3.0, 0.8, 0.6  # curve and tail
 _MOST_UNEVEN = 0.8
 _MOST_BY_STEP, _MOST_TAPER_BY_STEP = 0.6, 0.2  # of all these
+_BLURRIER_BY_STEP = 0.2  # by a step, of one needle's
 _SHORTER = 3  # attempts at a step that loses nothing
 _SQUARE_PX = (
     17  # side of squares than which all that is slower is left out, on bone; near enough the best for arms of half widths of 2.5 to 4
@@ -107,24 +124,24 @@ def fit_shared(
     held = precision * gain
     sizes = _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     arms = regular(sets) if len(needles[0].angles) == ARMS else None
-    at = _State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, arms)
-    asked = False
-    start, slopes, since = optics, list[list[Float]](), np.full(OPTICS, np.inf)
+    at = _State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, equal(sets), arms)
+    asked, asked_of_blurs, sizes_at = False, False, _SIZES_AFTER
+    start, slopes, since, of_blurs = optics, list[list[Float]](), np.full(OPTICS, np.inf), at.own_blurs
     last: list[Equations | None] = [None] * len(sets)
     before: tuple[_State, list[Equations], _Step] | None = None
     converged, shorter, least = False, 0, np.inf
-    for count in range(steps + 1):
+    for count in range(steps + _MORE_STEPS + 1):
         optics = _moved_optics(start, at.moved)
-        if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any():
-            slopes, since = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)], at.moved[:OPTICS]
+        if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or np.abs(at.own_blurs - of_blurs).max() > _MUCH[1]:
+            slopes = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)]
+            since, of_blurs = at.moved[:OPTICS], at.own_blurs
         systems = [
-            linearise(w, m, k, optics, noise, parallel, at.sizes.typical, spread, at.regularity, differs, e)
-            for w, m, k, spread, differs, e in zip(windows, at.sets, slopes, at.sizes.spread, at.differs, last, strict=True)
+            linearise(w, m, k, optics, noise, parallel, expected, e)
+            for w, m, k, expected, e in zip(windows, at.sets, slopes, at.expected, last, strict=True)
         ]
-        last = [*systems]
         cost = sum(e.cost for e in systems) + float(at.moved @ held @ at.moved)
         if before and cost > least + len(held) and shorter < _SHORTER and count < steps:
-            at, systems, step = before  # far from a straight line: back, and not as far
+            at, systems, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
             step, shorter, converged = step.shorter(), shorter + 1, False
         else:
             told = [e.information() for e in systems]
@@ -141,6 +158,19 @@ def fit_shared(
             surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, step.own, strict=True)])
             converged = count > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
             converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
+            if (converged or count >= _BLURS_AFTER) and not asked_of_blurs:
+                asked_of_blurs = True
+                if differ := _blurs(systems, gain):
+                    moved = at.moved.copy()
+                    moved[BENT] = [-was for was in (*start.curve, start.tail, *start.uneven)]  # a curve that made up for them leads astray
+                    at, converged, least, before = (
+                        replace(at, sets=differ[0], blurs=differ[1], moved=moved, sizes=sizes),
+                        False,
+                        np.inf,
+                        None,
+                    )
+                    steps, sizes_at = steps + _MORE_STEPS, count + 1 + _SIZES_AFTER
+                    continue
             if (converged or count >= _ASKED_AFTER) and not asked:  # near enough to tell how far their arms differ
                 asked = True
                 odd = _odd(systems, at, gain) if parallel else None
@@ -152,9 +182,9 @@ def fit_shared(
                     continue
             if converged and not alike:
                 break  # from so near the last step gets there as well; that to the sizes of all is longer
-        before = at, systems, step
+        before, last = (at, systems, step), [*systems]
         at = at.after(step, systems, parallel)
-        if alike and count + 1 == _SIZES_AFTER:
+        if alike and count + 1 == sizes_at:
             at, converged, least = replace(at, sizes=_sizes(systems, at.sets)), False, np.inf
     through = _quietest(film, windows, systems, noise)
     systems = [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
@@ -225,12 +255,20 @@ class _State:
     moved: Float
     taper: float
     sizes: _Sizes
+    blurs: Blurs
     regularity: Regularity | None
 
     @property
-    def differs(self) -> list[Float]:
-        """How far the arms of each tee may differ, by sets (m, 4)."""
-        return [np.zeros((len(m), WAYS)) for m in self.sets] if self.regularity is None else self.regularity.spread
+    def own_blurs(self) -> Float:
+        """Logarithms of the blurs of all needles over the film's."""
+        return np.array([f.blurrier for members in self.sets for f in members])
+
+    @property
+    def expected(self) -> list[Expected]:
+        """What is expected of the needles, by sets."""
+        ways = [np.zeros((len(m), WAYS)) for m in self.sets] if self.regularity is None else self.regularity.spread
+        each = zip(self.sizes.spread, self.blurs.spread, ways, strict=True)
+        return [Expected(self.sizes.typical, size, self.blurs.typical, blur, self.regularity, way) for size, blur, way in each]
 
     def after(self, step: _Step, systems: list[Equations], parallel: bool) -> _State:
         taper = self.taper + float(step.change[2])
@@ -239,7 +277,7 @@ class _State:
         known = self.regularity
         if known is not None and parallel:
             known = replace(known, common=known.common + step.change[SHARED:])
-        return _State(sets, self.moved + step.change, taper, sizes, known)
+        return _State(sets, self.moved + step.change, taper, sizes, self.blurs, known)
 
 
 def _sizes(systems: list[Equations], sets: list[list[NeedleFit]]) -> _Sizes:
@@ -258,6 +296,19 @@ def _odd(systems: list[Equations], at: _State, gain: float) -> Regularity | None
         return None
     ways, variances = zip(*(e.free_ways(at.regularity.common) for e in systems), strict=True)
     return told_by(list(ways), [gain * v for v in variances], at.regularity)
+
+
+def _blurs(systems: list[Equations], gain: float) -> tuple[list[list[NeedleFit]], Blurs] | None:
+    """Needles with blurs of their own, and how far these differ, where they do; ``gain``: of the variances, by noise of neighbours."""
+    blurs, variances = zip(*(e.free_blurs() for e in systems), strict=True)
+    told = differing(list(blurs), [gain * v for v in variances])
+    if told is None:
+        return None
+    sets = [
+        [replace(f, blurrier=between(b, -MOST_BLURRIER, MOST_BLURRIER)) for f, b in zip(e.members, of, strict=True)]
+        for e, of in zip(systems, blurs, strict=True)
+    ]
+    return sets, told
 
 
 def _is_uneven(precision: Float, told: Float, target: Float, moved: Float, gain: float) -> bool:
@@ -292,10 +343,10 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
     arms = len(members[0].angles)
     wider, longer, turns = *change[OPTICS:SHARED], change[SHARED:]
     turning = 1 if parallel else arms
-    each, ends = own_parameters(arms, parallel), 4 + turning + OF_SLANTS[arms].shape[1]
+    each, ends = own_parameters(arms, parallel), OWN + turning + OF_SLANTS[arms].shape[1]
     parts = delta[: each * len(members)].reshape(len(members), each)
-    shift, turn = float(np.abs(parts[:, :2]).max()), float(np.abs(parts[:, 4 : 4 + turning]).max())
-    scale = min(1.0, 1.0 / max(shift, 1e-9), 0.1 / max(turn, 1e-9))
+    shift, turn = float(np.abs(parts[:, :2]).max()), float(np.abs(parts[:, OWN : OWN + turning]).max())
+    scale = min(1.0, 1.0 / max(shift, 1e-9), 0.1 / max(turn, 1e-9), _BLURRIER_BY_STEP / max(float(np.abs(parts[:, OWN - 1]).max()), 1e-9))
     out = []
     for f, part in zip(members, scale * parts, strict=True):
         width, length = f.shape.half_width_px, f.shape.length_px
@@ -304,10 +355,11 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
         angles, lengths = moved_arms(f, ways) if arms == ARMS else (f.angles, f.shape.arms)
         length = max(length + between(part[3] + length * longer, -2.0, 2.0), 3.0)
         shape = NeedleShape(width, length, taper, lengths)
-        angles = angles + part[4 : 4 + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
-        slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[4 + turning : ends]).reshape(2, arms)
+        angles = angles + part[OWN : OWN + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
+        slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[OWN + turning : ends]).reshape(2, arms)
         slants = np.clip(slants, [[-SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
-        out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants))
+        blurrier = between(f.blurrier + part[OWN - 1], -MOST_BLURRIER, MOST_BLURRIER)
+        out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants, blurrier=blurrier))
     return out
 
 

@@ -33,6 +33,7 @@ _BEFORE = 1.5  # tolerance before attenuation and ends are fitted
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
 _ASIDE, _ASKEW = 0.3, 0.6  # radians by which a junction may point aside; part that arms explain which lie between those of a tee
+_AROUND, _DIRECTIONS = 1.3, np.linspace(0, 2 * np.pi, 32, endpoint=False)  # lengths from a tip at which no arms are, on which sides
 _TURNED = 0.2  # radians, from which a tee is not like another
 _SAME_JUNCTION = 0.5  # of the length of its arms, from a junction to the tip fitted to it
 _MOST_JUNCTIONS = 80
@@ -85,17 +86,18 @@ def find_tees(
         tees = fit_all(film, tees, optics, noise)
     around = tees
 
-    def beside(mine: list[NeedleFit]) -> Any:
+    def others_of(mine: list[NeedleFit]) -> Any:
         return others_beside(mine, [t for t in around if all(t is not m for m in mine)], optics)
 
-    tees = split_twins(film, tees, optics, noise, is_tee, beside)
+    tees = split_twins(film, tees, optics, noise, is_tee, others_of)
     tees = [t for t in tees if not goes_on(film, t, optics, others_beside(t, [o for o in tees if o is not t], optics))]
     if not tees:
         return [], [], optics
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     depth, background = (np.array([getattr(t, name) for t in nearly]) for name in ("depth", "background"))
-    optics = replace(optics, proportion=proportion(depth, background, background).slope)
+    beside = np.array([_beside(film, t, optics) for t in nearly])
+    optics = replace(optics, proportion=proportion(depth, background, beside).slope)
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
     clean = [t for t in fitted if is_tee(t)]
@@ -112,6 +114,14 @@ def find_tees(
 def _apart(rough: list[NeedleFit], known: list[NeedleFit], gap_px: float) -> list[NeedleFit]:
     """Leave out rough fits to what is known by now."""
     return [t for t in rough if all(math.dist(t.position_px, k.position_px) > gap_px for k in known)]
+
+
+def _beside(film: NDArray[Any], tee: NeedleFit, optics: Optics) -> float:
+    """Value of the film around a tee, a median: it has no share in the errors of the fit."""
+    reach = _AROUND * tee.shape.length_px + 4 * optics.sigma_px
+    place = tee.position_px[:, None] + reach * np.array([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)])
+    cols, rows = (np.clip(np.rint(at).astype(np.intp), 0, size - 1) for at, size in zip(place, film.shape[::-1], strict=True))
+    return float(np.nanmedian(film[rows, cols]))
 
 
 def first_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> list[NeedleFit]:

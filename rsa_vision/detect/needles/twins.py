@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -21,6 +22,7 @@ APART_PX = (2.5, 5.0, 8.0)  # separations tried; what is closer than half the fi
 _UNLIKE, _LEAST_UNLIKE = 2.5, 0.05  # misfits that call for a second look: against the film's typical one, and at least
 _BETTER = 0.6  # part of one tee's misfit that two may leave
 _EIGHTHS = np.pi / 4 * np.arange(4)
+_BLURRIER = (-0.25, 0.2, 0.4, 0.6)  # logarithms of a mark's own blur over the film's that are tried: a penumbra is no second tee
 _ALIKE = 4.0  # ratio of depths: images of one kind of mark, with more or less light
 
 
@@ -62,12 +64,25 @@ def split_twins(
             out.append(tee)
             continue
         model = clean[int(np.argmin([abs(c.shape.length_px - tee.shape.length_px) for c in clean]))]
-        pair = _split(film, tee, model, offsets, optics, noise, is_tee, others([tee]))
-        better = bool(pair) and max(p.misfit * abs(p.depth) for p in pair) < _BETTER * tee.misfit * abs(tee.depth)
-        out += pair if better else [tee]
+        beside = others([tee])
+        blurred = [_blurred(film, tee, b, optics, noise, beside) for b in _BLURRIER]
+        one = min([tee, *(b for b in blurred if is_tee(b) and math.dist(b.position_px, tee.position_px) < APART_PX[0])], key=_left)
+        pair = _split(film, tee, model, offsets, optics, noise, is_tee, beside)
+        better = bool(pair) and max(map(_left, pair)) < _BETTER * _left(one)
+        out += pair if better else [one]
         if better:
             offsets.insert(0, pair[1].position_px - pair[0].position_px)
     return out
+
+
+def _left(fit: NeedleFit) -> float:
+    """What a fit leaves, in film values."""
+    return fit.misfit * abs(fit.depth)
+
+
+def _blurred(film: NDArray[Any], tee: NeedleFit, blurrier: float, optics: Optics, noise: NoiseModel, beside: Any) -> NeedleFit:
+    """Fit a tee with a blur of its own."""
+    return fit_crossing(film, [replace(tee, blurrier=blurrier)], optics, noise, others=beside, steps=10)[0]
 
 
 def _split(
