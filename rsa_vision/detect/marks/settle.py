@@ -20,6 +20,7 @@ from rsa_vision.detect.balls.decide import EDGE
 from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.find import CHANCE
 from rsa_vision.detect.balls.fits import BallFits, slopes, uneven_white
+from rsa_vision.detect.balls.quanta import ENOUGH, left_and_expected, shared_more
 from rsa_vision.detect.balls.random_effects import Common, Solution, Windows, hold, solve, variance_of
 from rsa_vision.detect.balls.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.balls.usual import proportion, size_unlike, usual_size
@@ -35,6 +36,7 @@ from rsa_vision.types import Bool, Float, Int
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 _UNEVEN = 1.25  # the same, from which something may lie there
+_WHOLE = 0.95  # of the pixels under a ball
 MOST_COVERED = 0.85  # of a ball: from less it cannot be measured
 _TINY = 1e-12
 _NONE = 1e-3  # of a promised squared error
@@ -105,6 +107,7 @@ def settle(
     curve = curve_of(film)
     usual = float(np.median(balls.chi2_uneven[free])) if free.any() else 1.0  # what all balls leave is no speck on one
     out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
+    left, fitted = list[tuple[Float, Float]](), list[tuple[Int, Float, Float, int]]()
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
         for begin in range(0, len(these.balls), _BATCH):
@@ -126,6 +129,11 @@ def settle(
             stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _AGREE) & (better < CHANCE))
             moved = free[part] & ~(edged[part] & stays)
             out = _put(out, part, fits, moved)
+            clear_ones = np.flatnonzero(moved & (fits.chi2_ring < _UNEVEN) & (fits.valid_fraction > _WHOLE))
+            if len(clear_ones) and sum(len(of) for of, _ in left) < ENOUGH:
+                left.append(left_and_expected(solution, clear_ones, fits.background[clear_ones], known, these.half, common))
+            if moved.any():
+                fitted.append((part[moved], solution.estimator[moved], solution.weight[moved], 2 * these.half + 1))
             both[~crossed] = 0.0
             stay = free[part] & ~moved
             out.covariance[part[stay], :2, :2] += (both + hidden)[stay]
@@ -133,6 +141,12 @@ def settle(
             by_background = solution.estimator * solution.shade
             errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
         ratios.append(errors)
+    more = shared_more(left)
+    if more > 1:
+        others = np.setdiff1d(np.arange(len(free)), np.concatenate([part for part, *_ in fitted]))
+        out.covariance[others] *= more
+        for part, estimator, weight, side in fitted:
+            out.covariance[part, :2, :2] += (more - 1) * _of_noise(estimator, weight, side, common)
     by_size = np.zeros(len(free))
     by_size[edged] = size_unlike(balls.rows(edged), clear)
     return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], by_size, covered > MOST_COVERED
