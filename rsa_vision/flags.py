@@ -71,6 +71,7 @@ REASONS: Final[dict[str, str]] = {
     "few-controls": "two control points were found: little redundancy, a gross error would not show",
     "fiducial-residual": "fiducial marks do not fit within the limit: another cage build, a bent film, or a wrong mark",
     "control-residual": "the lines through the control points miss the focus by more than the limit",
+    "control-doubled": "most control points overlap other images, as those of a double focal spot do; look at the overlay",
     "focus-far": "the focus lies more than 150 mm from the nominal one; check the set-up in [foci]",
     "film-bend": "the mean y-parallax differs from zero: the film or cassette was not flat",
     "pair-ambiguous": "another pairing of the object markers explains the rays nearly as well",

@@ -72,6 +72,7 @@ def judge(reconstruction: Reconstruction, nominal_mm: Mapping[int, Sequence[floa
     """
     with_cage = [focus for focus in reconstruction.foci if focus.focus in nominal_mm]
     findings = [finding for focus in with_cage for finding in _judge_focus(focus, nominal_mm, limits)]
+    findings += [finding for focus in with_cage for finding in _judge_images(reconstruction, focus.focus)]
     return findings + _judge_markers(reconstruction.markers, limits)
 
 
@@ -127,6 +128,16 @@ def _judge_focus(focus: FocusSolution, nominal_mm: Mapping[int, Sequence[float]]
     if not away <= limits.focus_mm:
         findings.append(("focus-far", f"{name}: {away:.0f} mm from nominal (limit {limits.focus_mm:.0f})"))
     return findings
+
+
+def _judge_images(reconstruction: Reconstruction, focus: int) -> list[Finding]:
+    """Control points that are all shifted alike fit another focus exactly: no residual shows that, their flags do."""
+    points = reconstruction.points
+    controls = (points.role == "control") & (points.focus == focus) & reconstruction.used
+    lapped = np.count_nonzero(controls & ((points.flags & MarkerFlag.OVERLAP) != 0))
+    if 2 * lapped <= np.count_nonzero(controls):
+        return []
+    return [("control-doubled", f"focus {focus}: {lapped} of {np.count_nonzero(controls)} control points used overlap other images")]
 
 
 def _judge_markers(markers: Markers, limits: Limits) -> list[Finding]:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from rsa_vision.flags import MarkerFlag
 from rsa_vision.settings import Limits
-from rsa_vision.types import Markers
-from rsa_vision.verdict import _judge_markers
+from rsa_vision.types import ImagePoints, Markers, Reconstruction
+from rsa_vision.verdict import _judge_images, _judge_markers
 
 
 def markers(parallax_um: np.ndarray, sd_um: np.ndarray) -> Markers:
@@ -29,3 +30,25 @@ def test_a_common_parallax_is_excused_by_common_errors_alone(mean_um: float, sca
     parallax = mean_um + scatter_um * np.array([-1.0, 1, -1, 1, -1, 1])
     codes = [code for code, _ in _judge_markers(markers(parallax, np.array(sd_um)), Limits(parallax_um=100.0))]
     assert ("film-bend" in codes) == bent
+
+
+@pytest.mark.parametrize(("lapped", "used", "doubled"), [(5, 9, True), (4, 9, False), (5, 4, False), (0, 9, False), (0, 0, False)])
+def test_control_points_that_mostly_overlap_others_are_reviewed(lapped: int, used: int, doubled: bool) -> None:
+    """Of a double focal spot each control point may be two balls: one shift of all is another focus, and no residual shows it."""
+    n = 10  # of which the first of each focus is a fiducial mark
+    flags = np.where(np.arange(n) >= n - lapped, int(MarkerFlag.OVERLAP | MarkerFlag.UNLIKE), 0)
+    points = ImagePoints(
+        focus=np.repeat([1, 2], n),
+        role=np.tile(["fiducial", *["control"] * (n - 1)], 2),
+        number=np.arange(2 * n).astype(str),
+        shape=np.full(2 * n, "ball"),
+        position_px=np.zeros((2 * n, 2)),
+        covariance_px2=np.tile(np.eye(2), (2 * n, 1, 1)),
+        flags=np.append(flags, np.zeros(n, int)),
+        film=np.repeat([0, 1], n),
+    )
+    taken = np.tile(np.arange(n) <= used, 2)
+    nothing = markers(np.zeros(0), np.zeros(0))
+    reconstruction = Reconstruction(points, np.zeros((2 * n, 3)), np.zeros(2 * n), taken, (), nothing, nothing)
+    assert [code for code, _ in _judge_images(reconstruction, 1)] == ["control-doubled"] * doubled
+    assert not _judge_images(reconstruction, 2)
