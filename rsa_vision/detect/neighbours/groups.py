@@ -42,6 +42,7 @@ def fit_group(
     edge: bool = False,
     taken: bool = False,
     bent: bool = False,
+    blurrier: float = 0.0,
 ) -> BallFits:
     """Fit several balls in one window on one background.
 
@@ -61,6 +62,8 @@ def fit_group(
         Balls take away their part of it.
     bent : bool
         It may be curved.
+    blurrier : float
+        Logarithm of the blur of these balls over the film's, in the same window.
 
     Returns
     -------
@@ -71,6 +74,7 @@ def fit_group(
     k = len(start_px)
     window = window_around(film, start_px, start_radius_px, sigma_px, noise, others)
     size, cols, rows, valid, data = window.size, window.cols, window.rows, window.valid, window.raw - window.neighbours
+    sigma_px *= float(np.exp(blurrier))
     low, high = radii(sigma_px)
     local, radius = start_px - window.corner_px, np.clip(start_radius_px, low, high).astype(np.float64)
     surface = window.surface
