@@ -208,7 +208,9 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         rough.append(float(np.median(_roughness(tiles[chosen], variance[chosen]))))
         quiet.append(chosen)
     ranked = np.argsort(level)
-    ranked = ranked[np.array(rough)[ranked] < _STRUCTURE * max(min(rough), _OF_WHITE)]
+    # steps of one value are not how fine a film's noise is
+    finest = min((r for r, v in zip(rough, curve, strict=True) if v > _NO_NOISE), default=min(rough))
+    ranked = ranked[np.array(rough)[ranked] < _STRUCTURE * max(finest, _OF_WHITE)]
     level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], QUANTISATION))
     clean = curve_array >= np.array(curve)[ranked] * 0.999
     chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])

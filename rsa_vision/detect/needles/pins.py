@@ -32,6 +32,7 @@ _LEAST_OF_A_KIND = 3  # clear pins from which a film is one of pins: others then
 _ALONE = 5.0  # standard deviations of one pixel: lower ones, of which there are fewer, may be anything as long
 _RATHER_THAN_ROD, _RATHER_THAN_TURNED = 2.5, 7.0
 _ROD = 0.02  # taper of a rod: blunt
+_KNOWN = 0.12  # of its length, to which the tip of a pin is known even at CNR 5: trabeculae are pointed anyhow
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length, by the fourth power of the curve, by it and the logarithm of the depth, by the others
@@ -124,6 +125,9 @@ def find_pins(
     pins = _pointed(film, _distinct([f for f in pins if is_pin(f, noise, _STANDS_OUT_ROUGHLY)]), optics, noise)
     pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f, noise, _STANDS_OUT_ROUGHLY)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
+    pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
+    if len(pins) < _LEAST_OF_A_KIND:
+        pins = _standing_out(pins, noise)
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0
     return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f, noise, _STANDS_OUT_ROUGHLY)], optics
 
@@ -223,7 +227,7 @@ def _pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: N
     typical = float(np.median([f.shape.length_px for f in clear[:_SAMPLE]])) if clear else np.nan
     clear = [f for f in clear if _of_a_kind(f, typical)]
     if len(clear) < _LEAST_OF_A_KIND:
-        return [f for f in clear if f.height > _ALONE * float(np.sqrt(noise.variance_at(np.array(f.background))))]
+        return _standing_out(clear, noise)
     for fit, enough in zip(pins, alone, strict=True):
         if not enough:
             ways = [fit, _refit(film, _turned(fit), optics, noise)]
@@ -236,6 +240,11 @@ def _pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: N
 
 def _of_a_kind(fit: NeedleFit, typical_px: float) -> bool:
     return 1 / _OF_A_KIND < fit.shape.length_px / typical_px < _OF_A_KIND
+
+
+def _standing_out(pins: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
+    """Keep the pins whose form no noise hides: few have no company that tells what they are."""
+    return [f for f in pins if f.height > _ALONE * float(np.sqrt(noise.variance_at(np.array(f.background))))]
 
 
 def _turned(fit: NeedleFit) -> NeedleFit:

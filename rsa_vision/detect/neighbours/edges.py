@@ -22,6 +22,7 @@ OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added 
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
 _FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
 _BLURRIER = (-0.25, 0.15, 0.3, 0.5)  # logarithms of a ball's own blur over the film's that are tried: a penumbra is no edge
+_CLEAR = 50.0  # significance of balls of which blur is seen so well
 _MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: each makes what else is fitted less sure
 
 
@@ -74,7 +75,7 @@ def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
                 models.append((_gain(other, straight, noise) - _MORE_GAIN * (taken + bent), other))
         best, edged = max(models, key=lambda model: model[0])
         lost = plausible(plain, noise) & ~plausible(edged, noise)
-        if len(g) == 1 and _gain(edged, flat, noise) >= EDGE_GAIN:
+        if len(g) == 1 and plain.significance[0] > _CLEAR and _gain(edged, flat, noise) >= EDGE_GAIN:
             blurred = (fit_group(*at, blurrier=b) for b in _BLURRIER)
             flat = max([flat, *(b for b in blurred if b.converged.all())], key=lambda one: float(one.log_likelihood[0]))
         if _gain(edged, flat, noise) < EDGE_GAIN or not edged.converged.all() or lost.any():
