@@ -36,7 +36,7 @@ from rsa_vision.types import Bool, Float, Int
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
 _UNEVEN = 1.25  # the same, from which something may lie there
-_WHOLE = 0.95  # of the pixels under a ball
+_WHOLE, _DESCRIBED = 0.95, 6.0  # of the pixels under a ball; variance under it: what more the model leaves is not all even
 MOST_COVERED = 0.85  # of a ball: from less it cannot be measured
 _TINY = 1e-12
 _NONE = 1e-3  # of a promised squared error
@@ -129,7 +129,8 @@ def settle(
             stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _AGREE) & (better < CHANCE))
             moved = free[part] & ~(edged[part] & stays)
             out = _put(out, part, fits, moved)
-            clear_ones = np.flatnonzero(moved & (fits.chi2_ring < _UNEVEN) & (fits.valid_fraction > _WHOLE))
+            described = (fits.chi2_ring < _UNEVEN) & (fits.chi2_core < _DESCRIBED)
+            clear_ones = np.flatnonzero(moved & described & (fits.valid_fraction > _WHOLE))
             if len(clear_ones) and sum(len(of) for of, _ in left) < ENOUGH:
                 left.append(left_and_expected(solution, clear_ones, fits.background[clear_ones], known, these.half, common))
             if moved.any():

@@ -125,9 +125,9 @@ def find_pins(
     pins = _pointed(film, _distinct([f for f in pins if is_pin(f, noise, _STANDS_OUT_ROUGHLY)]), optics, noise)
     pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f, noise, _STANDS_OUT_ROUGHLY)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
-    pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
-    if len(pins) < _LEAST_OF_A_KIND:
-        pins = _standing_out(pins, noise)
+    if not tees:  # beside those a pin may be what is seen of one, and says so
+        pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
+        pins = pins if len(pins) >= _LEAST_OF_A_KIND else _standing_out(pins, noise)
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0
     return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f, noise, _STANDS_OUT_ROUGHLY)], optics
 

@@ -22,6 +22,7 @@ OF_SHIFT = 0.25  # of the square of what two models of an edge differ by: added 
 EDGE_GAIN = 40.0  # twice the log-likelihood that an edge of a dozen parameters must gain
 _FORESEEN = 0.75  # part of it that a score test must promise for the fits to be made
 _BLURRIER = (-0.25, 0.15, 0.3, 0.5)  # logarithms of a ball's own blur over the film's that are tried: a penumbra is no edge
+_EXPLAINED = 0.1  # of what the film's blur leaves of a ball, that its own may leave
 _CLEAR = 50.0  # significance of balls of which blur is seen so well
 _MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: each makes what else is fitted less sure
 
@@ -77,7 +78,9 @@ def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
         lost = plausible(plain, noise) & ~plausible(edged, noise)
         if len(g) == 1 and plain.significance[0] > _CLEAR and _gain(edged, flat, noise) >= EDGE_GAIN:
             blurred = (fit_group(*at, blurrier=b) for b in _BLURRIER)
-            flat = max([flat, *(b for b in blurred if b.converged.all())], key=lambda one: float(one.log_likelihood[0]))
+            # what film curves leave, no blur takes away
+            told = [b for b in blurred if b.converged.all() and b.chi2_core[0] < _EXPLAINED * flat.chi2_core[0]]
+            flat = max([flat, *told], key=lambda one: float(one.log_likelihood[0]))
         if _gain(edged, flat, noise) < EDGE_GAIN or not edged.converged.all() or lost.any():
             parts.append(plain)
             continue
