@@ -7,41 +7,34 @@ from one needle these are poor, from all of them they are good. Each needle's ow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.alike import true_spread
 from rsa_vision.detect.balls.leftover import LEAST, at_rims, usual_square
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.whitening import Filter
-from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window, window_of
 from rsa_vision.detect.needles.disturbed import louder
 from rsa_vision.detect.needles.equations import (
     BENT,
-    OF_SLANTS,
     OPTICS,
-    OWN,
-    SHARED,
-    SLANT,
     UNEVEN,
     Equations,
-    Expected,
     by_optics,
     linearise,
-    own_parameters,
 )
 from rsa_vision.detect.needles.fits import between, excess_of, scored
 from rsa_vision.detect.needles.grounds import errors_by_ground
-from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms, regular, told_by
+from rsa_vision.detect.needles.irregular import ARMS, Regularity, regular, told_by
 from rsa_vision.detect.needles.penumbra import MOST as MOST_BLURRIER
 from rsa_vision.detect.needles.penumbra import Blurs, differing, equal
 from rsa_vision.detect.needles.sets import beside_each, clusters
+from rsa_vision.detect.needles.states import Sizes, State, Step, change_of, moved_optics, sizes_of
 from rsa_vision.types import Float
 
 _STEPS = 12
@@ -50,7 +43,7 @@ _STEPS = 12
 _CONVERGED = {1: 0.15, 3: 0.25}
 _FINEST_PX = 0.02  # added to those, for the tables are interpolated
 _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
-_TAPER_ERROR, _LEAST_TAPER = 0.1, 0.1
+_TAPER_ERROR = 0.1
 _SIZE_ERROR = 1.0  # of those, before
 _ASKED_AFTER = 4  # steps, after which it is asked at the latest how far arms and blurs differ: what differs does not converge
 _BLURS_AFTER, _MORE_STEPS = 3, 6
@@ -65,17 +58,11 @@ _BY_CHANCE = 14.0  # chi2 of two degrees of freedom
 # of attenuation, blur, taper, curve, tail, uneven: changes from which derivatives by them are taken anew
 _MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1, 0.1, 0.1])
 _NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.1])  # changes of those with which the last step gets there
-_MOST = 3.0, 0.8, 0.6  # curve and tail
-_MOST_UNEVEN = 0.8
-_MOST_BY_STEP, _MOST_TAPER_BY_STEP = 0.6, 0.2  # of all these
-_BLURRIER_BY_STEP = 0.2  # by a step, of one needle's
 _SHORTER = 3  # attempts at a step that loses nothing
-_SQUARE_PX = (
-    17  # side of squares than which all that is slower is left out, on bone; near enough the best for arms of half widths of 2.5 to 4
-)
+# side of squares than which all that is slower is left out, on bone; near enough the best for arms of half widths of 2.5 to 4
+_SQUARE_PX = 17
 _GAIN = 0.2  # of the logarithm of the variance of tips, from which they are
 _ASKED = 8  # windows that tell whether it is to be
-_MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
 
 def fit_shared(
@@ -122,16 +109,16 @@ def fit_shared(
     # steps weigh pixels as if noise were white, and believe them the more the more neighbours share of it
     gain = float(noise.gain(np.hypot(optics.sigma_px, np.median([f.shape.half_width_px for f in needles]))))
     held = precision * gain
-    sizes = _Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
+    sizes = Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     arms = regular(sets) if len(needles[0].angles) == ARMS else None
-    at = _State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, equal(sets), arms)
+    at = State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, equal(sets), arms)
     asked, asked_of_blurs, sizes_at = False, False, _SIZES_AFTER
     start, slopes, since, of_blurs = optics, list[list[Float]](), np.full(OPTICS, np.inf), at.own_blurs
     last: list[Equations | None] = [None] * len(sets)
-    before: tuple[_State, list[Equations], _Step] | None = None
+    before: tuple[State, list[Equations], Step] | None = None
     converged, shorter, least = False, 0, np.inf
     for count in range(steps + _MORE_STEPS + 1):
-        optics = _moved_optics(start, at.moved)
+        optics = moved_optics(start, at.moved)
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or np.abs(at.own_blurs - of_blurs).max() > _MUCH[1]:
             slopes = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)]
             since, of_blurs = at.moved[:OPTICS], at.own_blurs
@@ -150,11 +137,11 @@ def fit_shared(
             if count == steps or converged:
                 break
             least, shorter = cost, 0
-            change = _change(normal, target - held @ at.moved, at.taper)
+            change = change_of(normal, target - held @ at.moved, at.taper)
             if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
                 change[:OPTICS] = 0.0  # new tables for so little are not worth their time
             far = float(change @ normal @ change) / len(change)
-            step = _Step(change, [e.step(change) for e in systems])
+            step = Step(change, [e.step(change) for e in systems])
             surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, step.own, strict=True)])
             converged = count > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
             converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
@@ -185,15 +172,15 @@ def fit_shared(
         before, last = (at, systems, step), [*systems]
         at = at.after(step, systems, parallel)
         if alike and count + 1 == sizes_at:
-            at, converged, least = replace(at, sizes=_sizes(systems, at.sets)), False, np.inf
+            at, converged, least = replace(at, sizes=sizes_of(systems, at.sets)), False, np.inf
     through = _quietest(film, windows, systems, noise)
     systems = [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
     told = [e.information() for e in systems]
     normal = precision + sum(matrix for matrix, _ in told)
-    change = _change(normal, sum(target for _, target in told) - precision @ at.moved, at.taper)
-    step = _Step(change, [e.step(change) for e in systems])
+    change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at.taper)
+    step = Step(change, [e.step(change) for e in systems])
     at = at.after(step, systems, parallel)
-    optics = _moved_optics(start, at.moved)
+    optics = moved_optics(start, at.moved)
     left = np.array([e.noise_under(own, change) for e, own in zip(systems, step.own, strict=True)])
     left = left[np.isfinite(left)]
     # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
@@ -210,87 +197,7 @@ def fit_shared(
     return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, more, strict=True)], optics
 
 
-def _change(normal: Float, target: Float, taper: float) -> Float:
-    """Change of the common parameters, not too far at once; the taper stays within its bounds, the others follow."""
-    change = np.linalg.solve(normal, target).astype(np.float64)
-    change *= _as_far(change)
-    held = between(change[2], _LEAST_TAPER - taper, 1.0 - taper)
-    if held != change[2]:
-        others = np.arange(len(change)) != 2
-        change[others] = np.linalg.solve(normal[np.ix_(others, others)], target[others] - normal[others, 2] * held)
-        change[2] = held
-        change *= _as_far(change)
-    return change
-
-
-def _as_far(change: Float) -> float:
-    """Part of a change that one step may go."""
-    return float(min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9), _MOST_TAPER_BY_STEP / max(abs(change[2]), 1e-9)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sizes:
-    """Logarithms of half width and length that are usual on a film, and what each needle may differ from them, by sets (m, 2)."""
-
-    typical: Float
-    spread: list[Float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Step:
-    """A change of the common parameters (c,), and of the own ones of each set."""
-
-    change: Float
-    own: list[Float]
-
-    def shorter(self) -> _Step:
-        return _Step(self.change / 3, [own / 3 for own in self.own])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _State:
-    """Where a fit is: needles by sets, what the common parameters (c,) differ from the start, their taper and their sizes."""
-
-    sets: list[list[NeedleFit]]
-    moved: Float
-    taper: float
-    sizes: _Sizes
-    blurs: Blurs
-    regularity: Regularity | None
-
-    @property
-    def own_blurs(self) -> Float:
-        """Logarithms of the blurs of all needles over the film's."""
-        return np.array([f.blurrier for members in self.sets for f in members])
-
-    @property
-    def expected(self) -> list[Expected]:
-        """What is expected of the needles, by sets."""
-        ways = [np.zeros((len(m), WAYS)) for m in self.sets] if self.regularity is None else self.regularity.spread
-        each = zip(self.sizes.spread, self.blurs.spread, ways, strict=True)
-        return [Expected(self.sizes.typical, size, self.blurs.typical, blur, self.regularity, way) for size, blur, way in each]
-
-    def after(self, step: _Step, systems: list[Equations], parallel: bool) -> _State:
-        taper = self.taper + float(step.change[2])
-        sets = [_moved(e.members, own, step.change, taper, parallel) for e, own in zip(systems, step.own, strict=True)]
-        sizes = replace(self.sizes, typical=self.sizes.typical + step.change[OPTICS:SHARED])
-        known = self.regularity
-        if known is not None and parallel:
-            known = replace(known, common=known.common + step.change[SHARED:])
-        return _State(sets, self.moved + step.change, taper, sizes, self.blurs, known)
-
-
-def _sizes(systems: list[Equations], sets: list[list[NeedleFit]]) -> _Sizes:
-    """What fits with sizes of their own tell of the sizes: pins of one cage are alike, but for how the rays meet them."""
-    size = np.array([[f.shape.half_width_px, f.shape.length_px] for members in sets for f in members])
-    variance = np.concatenate([e.variance_of_sizes for e in systems]) / size**2
-    values = np.log(size)
-    told = [true_spread(values[:, k], variance[:, k]) for k in range(2)]
-    spread = np.stack([np.where(belongs, sd, np.inf) for _, sd, belongs in told], axis=1)
-    return _Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
-
-
-def _odd(systems: list[Equations], at: _State, gain: float) -> Regularity | None:
+def _odd(systems: list[Equations], at: State, gain: float) -> Regularity | None:
     """How far arms differ, where they do; ``gain``: of the variances, by noise that neighbours share."""
     if at.regularity is None:
         return None
@@ -324,43 +231,6 @@ def _is_uneven(precision: Float, told: Float, target: Float, moved: Float, gain:
     covariance = np.linalg.inv(told + gain * free)
     uneven = moved[UNEVEN] + (covariance @ (target - gain * free @ moved))[UNEVEN]
     return bool(uneven @ np.linalg.solve(covariance[UNEVEN, UNEVEN], uneven) > gain * _BY_CHANCE)
-
-
-def _moved_optics(start: Optics, by: Float) -> Optics:
-    """Optics with these changes of the logarithms of attenuation and blur, of curve, tail and what is uneven."""
-    bow, skewed, tail = (
-        between(was + step, -most, most) for was, step, most in zip((*start.curve, start.tail), by[3:6], _MOST, strict=True)
-    )
-    dense, blurred = np.exp(by[:2]).tolist()
-    along, oblique = start.uneven + by[UNEVEN]
-    part = min(1.0, _MOST_UNEVEN / max(float(np.hypot(along, oblique)), 1e-9))
-    uneven = (float(along * part), float(oblique * part))
-    return replace(start, mu_px=start.mu_px * dense, sigma_px=start.sigma_px * blurred, curve=(bow, skewed), tail=tail, uneven=uneven)
-
-
-def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> list[NeedleFit]:
-    """Needles after a step of their own parameters and of the common ones."""
-    arms = len(members[0].angles)
-    wider, longer, turns = *change[OPTICS:SHARED], change[SHARED:]
-    turning = 1 if parallel else arms
-    each, ends = own_parameters(arms, parallel), OWN + turning + OF_SLANTS[arms].shape[1]
-    parts = delta[: each * len(members)].reshape(len(members), each)
-    shift, turn = float(np.abs(parts[:, :2]).max()), float(np.abs(parts[:, OWN : OWN + turning]).max())
-    scale = min(1.0, 1.0 / max(shift, 1e-9), 0.1 / max(turn, 1e-9), _BLURRIER_BY_STEP / max(float(np.abs(parts[:, OWN - 1]).max()), 1e-9))
-    out = []
-    for f, part in zip(members, scale * parts, strict=True):
-        width, length = f.shape.half_width_px, f.shape.length_px
-        width = between(width + between(part[2] + width * wider, -0.5, 0.5), 0.6, 0.3 * length)
-        ways = np.append(np.zeros(WAYS - each + ends), part[ends:])  # no leans where each arm has a direction of its own
-        angles, lengths = moved_arms(f, ways) if arms == ARMS else (f.angles, f.shape.arms)
-        length = max(length + between(part[3] + length * longer, -2.0, 2.0), 3.0)
-        shape = NeedleShape(width, length, taper, lengths)
-        angles = angles + part[OWN : OWN + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
-        slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[OWN + turning : ends]).reshape(2, arms)
-        slants = np.clip(slants, [[-SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
-        blurrier = between(f.blurrier + part[OWN - 1], -MOST_BLURRIER, MOST_BLURRIER)
-        out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants, blurrier=blurrier))
-    return out
 
 
 def _quietest(film: NDArray[Any], windows: list[Window], systems: list[Equations], noise: NoiseModel) -> Filter:

@@ -1,0 +1,173 @@
+"""Where a fit of all pins or tees of a film is, and where a step leads: not too far at once, and within the bounds of what can be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rsa_vision.detect.balls.alike import true_spread
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, OWN, SHARED, SLANT, UNEVEN, Equations, Expected, own_parameters
+from rsa_vision.detect.needles.fits import between
+from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms
+from rsa_vision.detect.needles.penumbra import MOST as MOST_BLURRIER
+from rsa_vision.detect.needles.penumbra import Blurs
+from rsa_vision.types import Float
+
+_LEAST_TAPER = 0.1
+_MOST = 3.0, 0.8, 0.6  # curve and tail
+_MOST_UNEVEN = 0.8
+_MOST_BY_STEP, _MOST_TAPER_BY_STEP = 0.6, 0.2  # of all these
+_BLURRIER_BY_STEP = 0.2  # by a step, of one needle's
+_MOST_SLANT, _MOST_SKEW = 0.6, 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sizes:
+    """Sizes of the needles of a film.
+
+    Attributes
+    ----------
+    typical : ndarray of shape (2,)
+        Logarithms of half width and length that are usual.
+    spread : list of ndarrays of shape (members, 2)
+        Standard deviations of each needle from them, by windows.
+    """
+
+    typical: Float
+    spread: list[Float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """A step of a fit.
+
+    Attributes
+    ----------
+    change : ndarray of shape (c,)
+        Of the common parameters.
+    own : list of ndarrays of shape (p,)
+        Of the own ones, by windows.
+    """
+
+    change: Float
+    own: list[Float]
+
+    def shorter(self) -> Step:
+        """Return a third of it."""
+        return Step(self.change / 3, [own / 3 for own in self.own])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Where a fit is.
+
+    Attributes
+    ----------
+    sets : list of lists of NeedleFit
+        By windows.
+    moved : ndarray of shape (c,)
+        What the common parameters differ from the start.
+    taper : float
+    sizes : Sizes
+    blurs : Blurs
+    regularity : Regularity, optional
+        Of the arms of tees.
+    """
+
+    sets: list[list[NeedleFit]]
+    moved: Float
+    taper: float
+    sizes: Sizes
+    blurs: Blurs
+    regularity: Regularity | None
+
+    @property
+    def own_blurs(self) -> Float:
+        """Logarithms of the blurs of all needles over the film's."""
+        return np.array([f.blurrier for members in self.sets for f in members])
+
+    @property
+    def expected(self) -> list[Expected]:
+        """What is expected of the needles, by sets."""
+        ways = [np.zeros((len(m), WAYS)) for m in self.sets] if self.regularity is None else self.regularity.spread
+        each = zip(self.sizes.spread, self.blurs.spread, ways, strict=True)
+        return [Expected(self.sizes.typical, size, self.blurs.typical, blur, self.regularity, way) for size, blur, way in each]
+
+    def after(self, step: Step, systems: list[Equations], parallel: bool) -> State:
+        """Return where a step leads from where these equations hold."""
+        taper = self.taper + float(step.change[2])
+        sets = [_moved(e.members, own, step.change, taper, parallel) for e, own in zip(systems, step.own, strict=True)]
+        sizes = replace(self.sizes, typical=self.sizes.typical + step.change[OPTICS:SHARED])
+        known = self.regularity
+        if known is not None and parallel:
+            known = replace(known, common=known.common + step.change[SHARED:])
+        return State(sets, self.moved + step.change, taper, sizes, self.blurs, known)
+
+
+def sizes_of(systems: list[Equations], sets: list[list[NeedleFit]]) -> Sizes:
+    """What fits with sizes of their own tell of the sizes: pins of one cage are alike, but for how the rays meet them."""
+    size = np.array([[f.shape.half_width_px, f.shape.length_px] for members in sets for f in members])
+    variance = np.concatenate([e.variance_of_sizes for e in systems]) / size**2
+    values = np.log(size)
+    told = [true_spread(values[:, k], variance[:, k]) for k in range(2)]
+    spread = np.stack([np.where(belongs, sd, np.inf) for _, sd, belongs in told], axis=1)
+    return Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
+
+
+def change_of(normal: Float, target: Float, taper: float) -> Float:
+    """Change of the common parameters, not too far at once; the taper stays within its bounds, the others follow."""
+    change = np.linalg.solve(normal, target).astype(np.float64)
+    change *= _as_far(change)
+    held = between(change[2], _LEAST_TAPER - taper, 1.0 - taper)
+    if held != change[2]:
+        others = np.arange(len(change)) != 2
+        change[others] = np.linalg.solve(normal[np.ix_(others, others)], target[others] - normal[others, 2] * held)
+        change[2] = held
+        change *= _as_far(change)
+    return change
+
+
+def _as_far(change: Float) -> float:
+    """Part of a change that one step may go."""
+    return float(min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9), _MOST_TAPER_BY_STEP / max(abs(change[2]), 1e-9)))
+
+
+def moved_optics(start: Optics, by: Float) -> Optics:
+    """Optics with these changes of the logarithms of attenuation and blur, of curve, tail and what is uneven."""
+    bow, skewed, tail = (
+        between(was + step, -most, most) for was, step, most in zip((*start.curve, start.tail), by[3:6], _MOST, strict=True)
+    )
+    dense, blurred = np.exp(by[:2]).tolist()
+    along, oblique = start.uneven + by[UNEVEN]
+    part = min(1.0, _MOST_UNEVEN / max(float(np.hypot(along, oblique)), 1e-9))
+    uneven = (float(along * part), float(oblique * part))
+    return replace(start, mu_px=start.mu_px * dense, sigma_px=start.sigma_px * blurred, curve=(bow, skewed), tail=tail, uneven=uneven)
+
+
+def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> list[NeedleFit]:
+    """Needles after a step of their own parameters and of the common ones."""
+    arms = len(members[0].angles)
+    wider, longer, turns = *change[OPTICS:SHARED], change[SHARED:]
+    turning = 1 if parallel else arms
+    each, ends = own_parameters(arms, parallel), OWN + turning + OF_SLANTS[arms].shape[1]
+    parts = delta[: each * len(members)].reshape(len(members), each)
+    shift, turn = float(np.abs(parts[:, :2]).max()), float(np.abs(parts[:, OWN : OWN + turning]).max())
+    scale = min(1.0, 1.0 / max(shift, 1e-9), 0.1 / max(turn, 1e-9), _BLURRIER_BY_STEP / max(float(np.abs(parts[:, OWN - 1]).max()), 1e-9))
+    out = []
+    for f, part in zip(members, scale * parts, strict=True):
+        width, length = f.shape.half_width_px, f.shape.length_px
+        width = between(width + between(part[2] + width * wider, -0.5, 0.5), 0.6, 0.3 * length)
+        ways = np.append(np.zeros(WAYS - each + ends), part[ends:])  # no leans where each arm has a direction of its own
+        angles, lengths = moved_arms(f, ways) if arms == ARMS else (f.angles, f.shape.arms)
+        length = max(length + between(part[3] + length * longer, -2.0, 2.0), 3.0)
+        shape = NeedleShape(width, length, taper, lengths)
+        angles = angles + part[OWN : OWN + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
+        slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[OWN + turning : ends]).reshape(2, arms)
+        slants = np.clip(slants, [[-SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
+        blurrier = between(f.blurrier + part[OWN - 1], -MOST_BLURRIER, MOST_BLURRIER)
+        out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants, blurrier=blurrier))
+    return out
