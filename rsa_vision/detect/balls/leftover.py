@@ -32,7 +32,7 @@ _MORE = 0.3  # part by which the variance under them is more, that is worth it
 _BY_CHANCE = 4.5  # two standard deviations of that, of one pixel: of odd parts, and neighbours share theirs
 _DOUBLINGS = np.linspace(0.0, 5.0, 21)  # of the variance: hardly anything comes through the middle of a ball where nothing is scattered
 _NEAREST = 0.9  # quantile of the backgrounds towards marks, beyond which odd ones may be
-_FARTHEST, _FAR = 0.75, 0.5  # quantile of how far balls reach beyond the curve, and part of it from which they tell how it goes on
+_FARTHEST, _FAR = 0.75, 0.5  # quantile of how far marks reach beyond the curve, and part of it from which they tell how it goes on
 
 
 def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least_pixels: float = _LEAST_PIXELS) -> NoiseModel:
@@ -62,13 +62,10 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least
         return noise
     guess = guessed_optics(float(np.median(sure.radius_px)))
     sign, height = float(np.sign(sure.depth[0])), height_of(sure, guess.sigma_px)
-    noise = noise.before_gap(sign * float(np.quantile(sign * sure.background, _NEAREST)), sign, float(np.quantile(height, _FARTHEST)))
-    end = noise.level[-1 if sign > 0 else 0]
-    reach = sign * (sure.background - end) + height
-    farthest = float(np.quantile(reach, _FARTHEST))
-    sure = sure.rows(reach > _FAR * farthest)
+    noise, farthest, tell = beyond_curve(noise, sign, sure.background, height)
+    sure = sure.rows(tell)
     sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
-    if farthest <= 0 or _pixels(sure) < least_pixels:
+    if _pixels(sure) < least_pixels:
         return noise
     places = free_places(film, sure, seeds.position_px, seeds.radius_px + guess.sigma_px, guess, noise)
     reach_px = float(np.median(sure.radius_px)) + guess.sigma_px
@@ -90,7 +87,34 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least
     usual = float(np.quantile(beside, _QUARTILE))
     if not worth_it(under(noise), usual, _pixels(fits)):
         return noise
-    return carried_to(noise, end + sign * farthest, under, usual)
+    return carried_to(noise, farthest, under, usual)
+
+
+def beyond_curve(noise: NoiseModel, sign: float, background: Float, height: Float) -> tuple[NoiseModel, float, Bool]:
+    """Tell how far marks reach beyond the values for which the noise is known.
+
+    Parameters
+    ----------
+    noise : NoiseModel
+    sign : float
+        Of their depths.
+    background, height : ndarray of shape (n,)
+        Of the marks.
+
+    Returns
+    -------
+    noise : NoiseModel
+        Without values beyond a gap, as shutters have.
+    farthest : float
+        Film value that most marks do not exceed.
+    tell : ndarray of bool, shape (n,)
+        Which marks reach so far that they tell how the noise goes on; none where most do not reach beyond it.
+    """
+    noise = noise.before_gap(sign * float(np.quantile(sign * background, _NEAREST)), sign, float(np.quantile(height, _FARTHEST)))
+    end = float(noise.level[-1 if sign > 0 else 0])
+    reach = sign * (background - end) + height
+    farthest = float(np.quantile(reach, _FARTHEST))
+    return noise, end + sign * farthest, np.asarray((reach > _FAR * farthest) & (farthest > 0))
 
 
 def worth_it(under: float, usual: float, pixels: float) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter, shift
 
-from rsa_vision.detect.balls.leftover import carried_to, worth_it
+from rsa_vision.detect.balls.leftover import beyond_curve, carried_to, worth_it
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.needles import NeedleFit, arm_images
@@ -21,8 +21,6 @@ _BODY = 0.2, 0.85  # of the length of an arm: neither the tip nor the thick end,
 _HIGH = 0.4  # of the height of an arm's image: what is under it
 _GAP_PX, _STRIP_PX = 3.0, 8.0  # from an arm to what is beside it; how wide that is
 _LEAST_PIXELS = 12  # under an arm, and beside it
-_NEAREST = 0.9  # as of balls
-_FARTHEST, _FAR = 0.75, 0.5  # quantile of how far needles reach beyond the curve, and part of it from which they tell how it goes on
 _NORMAL = 0.4549  # median of the square of a normal deviate
 
 
@@ -67,19 +65,15 @@ def noise_under_needles(film: NDArray[Any], fits: list[NeedleFit], optics: Optic
         return noise
     sign = float(np.sign(fits[0].depth))
     background, height = np.array([(f.background, f.height) for f in fits]).T
-    noise = noise.before_gap(sign * float(np.quantile(sign * background, _NEAREST)), sign, float(np.quantile(height, _FARTHEST)))
-    end = float(noise.level[-1 if sign > 0 else 0])
-    reach = sign * (background - end) + height
-    if (farthest := float(np.quantile(reach, _FARTHEST))) <= 0:
-        return noise
-    arms = [arm for f, far in zip(fits, reach, strict=True) if far > _FAR * farthest for arm in _arms(film, f, optics, noise)]
+    noise, farthest, tell = beyond_curve(noise, sign, background, height)
+    arms = [arm for f, of in zip(fits, tell, strict=True) if of for arm in _arms(film, f, optics, noise)]
 
     def under(trial: NoiseModel) -> float:
         return float(np.median([np.mean(a.bent**2 / trial.variance_at(a.level)) / a.beside for a in arms]))
 
     if not arms or not worth_it(under(noise), 1.0, sum(len(a.bent) for a in arms)):
         return noise
-    return carried_to(noise, end + sign * farthest, under, 1.0)
+    return carried_to(noise, farthest, under, 1.0)
 
 
 def _arms(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> list[_Arm]:
