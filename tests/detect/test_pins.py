@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
-from rsa_vision.detect.needles.pins import is_pin
+from rsa_vision.detect.needles.pointed import is_pin
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.crowd import out_of_a_crowd
-from rsa_vision.detect.balls.decide import are_balls, faint_beside, look_clear, show_what_marks_are_like
-from rsa_vision.detect.balls.find import MISFIT, fit_at, plausible
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, are_balls, faint_beside, look_clear, show_what_marks_are_like
+from rsa_vision.detect.balls.find import MISFIT, STRENGTH, fit_at, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import free_places
@@ -75,8 +75,9 @@ def marks_of(
         For this polarity.
     """
     mine = _of_sign(candidates, seen.sign)
-    needles = _find_needles(film, mine, _of_sign(faint, seen.sign).strokes, candidates.strokes, rough_pins, seen)
-    found, tees = _find_balls(film, mine, _of_sign(faint, seen.sign), needles, seen, limit, mottled=mottled)
+    faint = _of_sign(faint, seen.sign)
+    needles = _find_needles(film, mine, faint, candidates.strokes, rough_pins, seen)
+    found, tees = _find_balls(film, mine, faint, needles, seen, limit, mottled=mottled)
     return _measured(film, bits, found, replace(needles, tees=tees), seen.optics, seen.noise)
 
 
@@ -103,17 +104,26 @@ class _Needles:
 
 
 def _find_needles(
-    film: NDArray[Any], mine: Candidates, strokes: Float, all_strokes: Float, rough_pins: list[NeedleFit], seen: Seen
+    film: NDArray[Any], mine: Candidates, faint: Candidates, all_strokes: Float, rough_pins: list[NeedleFit], seen: Seen
 ) -> _Needles:
     sign, optics, noise = seen.sign, seen.optics, seen.noise
-    tees, doubtful, tee_optics = find_tees(film, mine.junctions, strokes, optics, noise)
+    tees, doubtful, tee_optics = find_tees(film, mine.junctions, faint.strokes, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
     tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seen.looks, optics, noise), strict=True) if not ball]
-    more_pins = look_for_pins(film, all_strokes[~on_arms(all_strokes[:, :2], tees)], noise)
-    pins, pin_optics = find_pins(film, [p for p in rough_pins + more_pins if np.sign(p.depth) == sign], tees, optics, noise)
+    perhaps = [*tees, *doubtful] if len(tees) >= LEAST_KNOWN else tees  # whose arms are no pins
+    more_pins = look_for_pins(film, all_strokes[~on_arms(all_strokes[:, :2], perhaps)], noise)
+    rough_pins = [p for p in rough_pins + more_pins if np.sign(p.depth) == sign]
+    places = _likeliest_first(faint)
+    pins, pin_optics = find_pins(film, rough_pins, places[~on_arms(places, perhaps)], perhaps, optics, noise)
     pins = [p for p in pins if is_located(p)]
     painted = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
     return _Needles(tees, pins, doubtful, tee_optics, off_pins(seen.looks, more_pins), painted)
+
+
+def _likeliest_first(candidates: Candidates) -> Float:
+    """Places (n, 2) at which the search answers, round or long."""
+    strength = np.abs(np.concatenate([candidates.strength, STRENGTH * candidates.strokes[:, 5]]))
+    return np.concatenate([candidates.position_px, candidates.strokes[:, :2]])[np.argsort(-strength)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

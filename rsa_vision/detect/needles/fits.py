@@ -35,6 +35,7 @@ def fit_needles(
     noise: NoiseModel,
     *,
     quick: bool = False,
+    sized: bool = False,
 ) -> NeedleFit:
     """Fit one pin (one angle) or tee (three, that turn together and are equally deep).
 
@@ -53,6 +54,8 @@ def fit_needles(
     noise : NoiseModel
     quick : bool
         While others still move: fewer steps, fewer pixels around.
+    sized : bool
+        Its size is known.
 
     Returns
     -------
@@ -73,18 +76,20 @@ def fit_needles(
         return _unfit(tip, angles, shape)
     surface = polynomial(half, cols - tip_px[0], rows - tip_px[1]).T
     weight = np.full(len(data), 1.0 / float(noise.variance_at(np.array([data.mean()]))[0]))
-    converged = False
+    converged, free = False, [1, 2, 5] if sized else [1, 2, 3, 4, 5]
     steps, close, far = (6, _CLOSE_PX, 3.0) if quick else (_STEPS, _CONVERGED_PX, 1.5)
     for step in range(steps + 1):
         last = step == steps or converged  # nobody asks where to go next
         images = arm_images(cols - tip[0], rows - tip[1], angles, shape, optics, slopes=not last).sum(1)
-        moves, linear = images[1:], np.concatenate([images[:1], surface])
+        moves, linear = images[[] if last else free], np.concatenate([images[:1], surface])
         weighted = np.concatenate([moves, linear, data[None]]) * np.sqrt(weight)
         gram = weighted @ weighted.T
         theta = damped_solution(gram[len(moves) : -1, len(moves) : -1], gram[len(moves) : -1, -1], 1e-9)
         if last:
             break
-        delta = step_of(gram, theta, len(moves), 1e-4 if step < 4 else 1e-7)
+        delta = np.zeros(1 + _MOVES)
+        delta[free] = step_of(gram, theta, len(moves), 1e-4 if step < 4 else 1e-7)
+        delta = delta[1:]
         if step in (0, 3):
             weight = 1.0 / noise.variance_at(theta @ linear)
         scale = min(1.0, far / max(np.abs(delta[:2]).max(), 1e-9), 0.15 / max(abs(delta[4]), 1e-9))
@@ -210,11 +215,14 @@ def significance_of(image: Float, surface: Float, weight: Float) -> float:
     return float(np.sqrt(max(gram[-1, -1] - alike, 0.0)))
 
 
-def explains(fit: NeedleFit, least: float, stands_out: float = STANDS_OUT) -> bool:
-    """Say whether a fit explains a part of what is under it: of all, or, where it stands out so far, of what is more than the noise."""
+def explains(fit: NeedleFit, least: float, stands_out: float = STANDS_OUT, by_chance: float = 0.0) -> bool:
+    """Say whether a fit explains a part of what is under it: of all, or, where it stands out so far, of what is more than the noise.
+
+    ``by_chance``: part of the variance that noise may leave more than usual.
+    """
     left = fit.chi2_core
     raised = left / max(1.0 - fit.explained, 1e-9)
-    over_noise = 1.0 - max(left - 1.0, 0.0) / max(raised - 1.0, 1e-9)
+    over_noise = 1.0 - max(left - 1.0 - by_chance, 0.0) / max(raised - 1.0, 1e-9)
     significance = fit.significance / np.sqrt(max(fit.chi2_ring, 1.0))
     return bool(fit.explained > least or (raised > 1.0 and over_noise > least and significance > stands_out))
 

@@ -9,36 +9,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX, MISFIT
+from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
-from rsa_vision.detect.needles.fits import STANDS_OUT, excess_of, explains, fit_needles, significant_misfit
+from rsa_vision.detect.needles.fits import excess_of, explains, fit_needles, significant_misfit
 from rsa_vision.detect.needles.optics import common_optics
+from rsa_vision.detect.needles.pointed import (
+    EXPLAINED,
+    LEAST_OF_A_KIND,
+    STANDS_OUT_ROUGHLY,
+    SURER_THAN_ROD,
+    is_pin,
+    middle,
+    pointed,
+    same_body,
+    standing_out,
+    unexplained,
+)
 from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, on_arms
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.types import Bool, Float
 
-SLIM = 4.5  # length over half the width; two balls side by side have four
-EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters leave more
 BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 MOST_STROKES = 120  # strongest of a film, most of them seen by two filters
+_ROUGH = 0.85  # explained by a first look, with guessed optics
 _MOST_IN_VAIN = 20  # strokes in a row that are no pins
-_ROUGH, _STANDS_OUT_ROUGHLY = 0.85, 11.0  # explained by a first look, with guessed optics; its significance
-_SIGNIFICANT = 9.0
-_SURER_THAN_ROD = 12.0  # half the chi2 by which a rod must be worse
-_LEAST_OF_A_KIND = 3  # clear pins from which a film is one of pins: others then need less
-_ALONE = 5.0  # standard deviations of one pixel: lower ones, of which there are fewer, may be anything as long
-_RATHER_THAN_ROD, _RATHER_THAN_TURNED = 2.5, 7.0
-_ROD = 0.02  # taper of a rod: blunt
 _KNOWN = 0.12  # of its length, to which the tip of a pin is known even at CNR 5: trabeculae are pointed anyhow
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length, by the fourth power of the curve, by it and the logarithm of the depth, by the others
 _OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.01, 0.05, 0.03, 2.0
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
-_OF_A_KIND = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
 _SAMPLE = 6
 _MOST_ASKED = 18  # for the optics that they have in common
 _CLOSE_FIT = 0.03  # misfit and what is not explained, of a pin whose taper is right
@@ -70,13 +73,13 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
         in_vain += 1
         fits: list[NeedleFit] = []
         for turn in (angle, angle + np.pi):
-            if fits and _left(fits[0]) < _CLOSE_FIT:
+            if fits and unexplained(fits[0]) < _CLOSE_FIT:
                 break
             start = NeedleShape(max(0.9, 0.5 * width), 1.45 * length, TAPERS[0])  # the answer fades before the tip
             tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
             fits.append(fit_needles(film, tip, np.array([turn]), start, guess, noise, quick=True))
         best = max(fits, key=lambda f: f.explained)
-        if explains(best, _ROUGH, _STANDS_OUT_ROUGHLY):
+        if explains(best, _ROUGH, STANDS_OUT_ROUGHLY):
             found.append(best)
             in_vain = 0
         if in_vain == _MOST_IN_VAIN:
@@ -85,7 +88,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
 
 
 def find_pins(
-    film: NDArray[Any], rough: list[NeedleFit], tees: list[NeedleFit], optics: Optics, noise: NoiseModel
+    film: NDArray[Any], rough: list[NeedleFit], places: Float, tees: list[NeedleFit], optics: Optics, noise: NoiseModel
 ) -> tuple[list[NeedleFit], Optics]:
     """Fit what may be single pins, and keep those that are.
 
@@ -94,6 +97,8 @@ def find_pins(
     film : ndarray of shape (rows, cols)
     rough : list of NeedleFit
         As of :func:`look_for_pins`, one polarity, perhaps of several looks.
+    places : ndarray of shape (n, 2)
+        Where others may be, (col, row), likeliest first.
     tees : list of NeedleFit
         Their arms are no single pins.
     optics : Optics
@@ -105,7 +110,7 @@ def find_pins(
     optics : Optics
         With the attenuation that suits the pins.
     """
-    on_tees = on_arms(np.array([_middle(f) for f in rough]).reshape(-1, 2), tees)
+    on_tees = on_arms(np.array([middle(f) for f in rough]).reshape(-1, 2), tees)
     rough = _distinct([f for f, on in zip(rough, on_tees, strict=True) if not on])
     if not rough:
         return [], optics
@@ -119,17 +124,17 @@ def find_pins(
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
     pins = [
-        min((_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes), key=_left)
+        min((_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes), key=unexplained)
         for f, shapes in zip(rough, starts, strict=True)
     ]
-    pins = _pointed(film, _distinct([f for f in pins if is_pin(f, noise, _STANDS_OUT_ROUGHLY)]), optics, noise)
-    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f, noise, _STANDS_OUT_ROUGHLY)]
+    pins = pointed(film, _distinct([f for f in pins if is_pin(f, noise, STANDS_OUT_ROUGHLY)]), places, optics, noise)
+    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f, noise, STANDS_OUT_ROUGHLY)]
     pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
     if not tees:  # beside those a pin may be what is seen of one, and says so
         pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
-        pins = pins if len(pins) >= _LEAST_OF_A_KIND else _standing_out(pins, noise)
+        pins = pins if len(pins) >= LEAST_OF_A_KIND else standing_out(pins, noise)
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0
-    return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f, noise, _STANDS_OUT_ROUGHLY)], optics
+    return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f, noise, STANDS_OUT_ROUGHLY)], optics
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
@@ -175,7 +180,7 @@ def _likeliest(
             last = left
     least = np.min(list(chi2.values()), axis=0)
     scale = 2 * np.maximum(least / [len(window.data) for window in windows], 1.0)
-    worse = {trial: float(np.minimum((left - least) / scale, _SURER_THAN_ROD).sum()) for trial, left in chi2.items()}
+    worse = {trial: float(np.minimum((left - least) / scale, SURER_THAN_ROD).sum()) for trial, left in chi2.items()}
     best = min(worse, key=lambda trial: worse[trial])
     return *best, fits[best]
 
@@ -200,71 +205,8 @@ def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
     return on
 
 
-def is_slim(fit: NeedleFit) -> bool:
-    """Say whether a fit is longer than two balls side by side."""
-    return fit.shape.length_px > SLIM * fit.shape.half_width_px
-
-
-def is_pin(fit: NeedleFit, noise: NoiseModel, stands_out: float = STANDS_OUT) -> bool:
-    """Say whether a fit looks like a pin: little misfit that chance does not explain, slim, all of it on the film.
-
-    ``stands_out``: significance from which noise may hide its form.
-    """
-    if not np.isfinite(fit.misfit) or fit.significance < _SIGNIFICANT or fit.valid_fraction < 0.9:
-        return False
-    return bool(is_slim(fit) and significant_misfit(fit, noise) < MISFIT and explains(fit, EXPLAINED, stands_out))
-
-
 def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
     return fit_needles(film, fit.position_px, fit.angles, fit.shape, optics, noise)
-
-
-def _pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
-    """Keep what is no rod; where noise hides the points of some, those of their kind tell that they are pins."""
-    surer = [_surer_than_rod(film, f, optics, noise) for f in pins]
-    alone = [by > _SURER_THAN_ROD and is_pin(f, noise) for f, by in zip(pins, surer, strict=True)]
-    clear = [f for f, enough in zip(pins, alone, strict=True) if enough]
-    typical = float(np.median([f.shape.length_px for f in clear[:_SAMPLE]])) if clear else np.nan
-    clear = [f for f in clear if _of_a_kind(f, typical)]
-    if len(clear) < _LEAST_OF_A_KIND:
-        return _standing_out(clear, noise)
-    for fit, enough in zip(pins, alone, strict=True):
-        if not enough:
-            ways = [fit, _refit(film, _turned(fit), optics, noise)]
-            best, other = sorted(ways, key=_left)
-            rather = is_pin(best, noise, _STANDS_OUT_ROUGHLY) and _of_a_kind(best, typical)
-            rather = rather and _worse_by(film, best, other, optics, noise) > _RATHER_THAN_TURNED
-            clear += [best] if rather and _surer_than_rod(film, best, optics, noise) > _RATHER_THAN_ROD else []
-    return clear
-
-
-def _of_a_kind(fit: NeedleFit, typical_px: float) -> bool:
-    return 1 / _OF_A_KIND < fit.shape.length_px / typical_px < _OF_A_KIND
-
-
-def _standing_out(pins: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
-    """Keep the pins whose form no noise hides: few have no company that tells what they are."""
-    return [f for f in pins if f.height > _ALONE * float(np.sqrt(noise.variance_at(np.array(f.background))))]
-
-
-def _turned(fit: NeedleFit) -> NeedleFit:
-    """The same pin the other way round."""
-    way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
-    return replace(fit, position_px=fit.position_px + fit.shape.length_px * way, angles=fit.angles + np.pi)
-
-
-def _surer_than_rod(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
-    """Return half the chi2 by which a rod of free length, width and direction in the pin's place is worse."""
-    thinner = replace(fit.shape, taper=_ROD, half_width_px=0.7 * fit.shape.half_width_px, length_px=0.8 * fit.shape.length_px)
-    back = fit.position_px + 0.2 * fit.shape.length_px * np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
-    return _worse_by(film, fit, fit_needles(film, back, fit.angles, thinner, optics, noise), optics, noise)
-
-
-def _worse_by(film: NDArray[Any], fit: NeedleFit, other: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
-    """Return half the chi2 by which another fit in the place of one is worse, on the same pixels."""
-    window = window_of(film, [fit], optics, noise, None)
-    left, left_by_other = (chi2_of(window, f, optics, noise) for f in (fit, other))
-    return 0.5 * (left_by_other - left) / max(left / len(window.data), 1.0)
 
 
 def _proportion(pins: list[NeedleFit]) -> float:
@@ -293,24 +235,9 @@ def _less_sure_along(fit: NeedleFit, typical: float, optics: Optics, noise: Nois
     return replace(fit, covariance_px2=fit.covariance_px2 + error_px**2 * np.outer(way, way))
 
 
-def _left(fit: NeedleFit) -> float:
-    return fit.misfit + 1 - fit.explained
-
-
 def _distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
-    for fit in sorted(pins, key=_left):
-        if all(math.dist(fit.position_px, k.position_px) > NEAREST_PX and not _same_body(fit, k) for k in kept):
+    for fit in sorted(pins, key=unexplained):
+        if all(math.dist(fit.position_px, k.position_px) > NEAREST_PX and not same_body(fit, k) for k in kept):
             kept.append(fit)
     return kept
-
-
-def _same_body(a: NeedleFit, b: NeedleFit) -> bool:
-    """Say whether two fits lie on the same stroke, perhaps the other way round."""
-    return math.dist(_middle(a), _middle(b)) < 0.25 * a.shape.length_px
-
-
-def _middle(fit: NeedleFit) -> Float:
-    half, angle = 0.5 * fit.shape.length_px, float(fit.angles[0])
-    middle: Float = fit.position_px + half * np.array([math.cos(angle), -math.sin(angle)])
-    return middle

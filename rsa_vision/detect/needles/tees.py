@@ -107,8 +107,9 @@ def find_tees(
             rough = _apart([t for t in fitted if all(t is not c for c in clean)], more, NEAREST_PX)
             others = _apart(others, more, _SAME_JUNCTION * clean[0].shape.length_px)
             fitted, optics = fit_shared(bare, [*clean, *rough, *more], optics, noise, parallel=True)
-    others += [replace(t, slants=None) for t in fitted if not is_tee(t)]
-    return [t for t in fitted if is_tee(t)], [t for t in others if is_tee(t, slack=ROUGH)], optics
+    slack = _BEFORE if len(clean) >= _LEAST_PARALLEL else 1.0  # of what is parallel to others, and as large, bone may leave more
+    others += [replace(t, slants=None) for t in fitted if not is_tee(t, slack)]
+    return [t for t in fitted if is_tee(t, slack)], [t for t in others if is_tee(t, slack=ROUGH)], optics
 
 
 def _apart(rough: list[NeedleFit], known: list[NeedleFit], gap_px: float) -> list[NeedleFit]:
@@ -215,7 +216,7 @@ def _turned(fit: NeedleFit, model: NeedleFit) -> bool:
 def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
     """Fit a tee at each junction until enough are clean; best first."""
     rough: list[NeedleFit] = []
-    for col, row, angle, ring, _ in junctions:
+    for col, row, angle, ring, strength in junctions:
         start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
         tried: list[NeedleFit] = []
         for turn in (0.0, _ASIDE, -_ASIDE):
@@ -223,7 +224,8 @@ def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Op
             tried.append(fit_needles(film, np.array([col, row]), angles, start, optics, noise))
             if is_tee(tried[-1]) or tried[0].explained < _ASKEW:
                 break
-        rough += sorted((f for f in tried if is_tee(f, slack=ROUGH)), key=_left)[:1]
+        like = (f for f in tried if is_tee(f, slack=ROUGH) and f.depth * strength < 0)  # the answer has the other sign
+        rough += sorted(like, key=_left)[:1]
         clean = [f for f in rough if is_tee(f)]
         if len(clean) >= ENOUGH and not any(_turned(f, clean[0]) for f in clean):
             break

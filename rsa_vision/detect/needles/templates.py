@@ -24,6 +24,7 @@ LIKENESS = 0.4  # correlation coefficient from which a place is worth a fit; two
 SCALE = 2  # the film is searched at half resolution
 _BAND = 256  # rows of that, which stay in the cache
 _AROUND = np.arange(-2, 3)  # pixels of that, over which a peak is the highest
+_MEAN_OF = 0.33  # of the window's side: more than arms are wide, less than bones are
 _SPARSE = 16  # every so-manieth pixel tells the mean of a film
 _LEAST_VARIANCE = 0.02  # of rounded values, means of four
 
@@ -71,8 +72,9 @@ def find_like(film: NDArray[Any], template: NDArray[np.float32]) -> Float:
 
 def _correlation(image: NDArray[Any], template: NDArray[np.float32]) -> NDArray[np.float32]:
     """Correlation coefficient with all windows of an image, whose spread changes slowly from place to place: every second one tells it."""
-    side, bare = len(template), template - template.mean()
+    side, bare = len(template), _without_slopes(template, len(template), cv2.BORDER_CONSTANT)
     image = np.subtract(image, image[::_SPARSE, ::_SPARSE].mean(), dtype=np.float32)
+    image, bare = _without_slopes(image, side, cv2.BORDER_REFLECT), bare - bare.mean()
     product = cv2.matchTemplate(image, bare, cv2.TM_CCORR)
     even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
     twice, box = even.shape[::-1], (side // 2 + 1) // 2 * 2 + 1  # odd, of about as many pixels as the template
@@ -84,6 +86,12 @@ def _correlation(image: NDArray[Any], template: NDArray[np.float32]) -> NDArray[
     spread = cv2.resize(cv2.sqrt(np.maximum(variance, np.float32(_LEAST_VARIANCE))), twice, interpolation=cv2.INTER_LINEAR)
     inside = tuple(slice(side // 2, side // 2 + n) for n in product.shape)
     return np.asarray(cv2.divide(product, spread[inside], dst=product, scale=1 / (side * float(np.linalg.norm(bare)))))
+
+
+def _without_slopes(image: NDArray[np.float32], side: int, border: int) -> NDArray[np.float32]:
+    """Return an image less its mean around each pixel: over the window of a tee the slope of a bone differs more than the tee does."""
+    box = int(side * _MEAN_OF) | 1
+    return np.asarray(cv2.subtract(image, cv2.blur(image, (box, box), borderType=border)))
 
 
 def promising(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optics, noise: NoiseModel) -> tuple[Bool, Float]:
