@@ -78,7 +78,7 @@ def marks_of(
     faint = _of_sign(faint, seen.sign)
     needles = _find_needles(film, mine, faint, candidates.strokes, rough_pins, seen)
     found, tees = _find_balls(film, mine, faint, needles, seen, limit, mottled=mottled)
-    return _measured(film, bits, found, replace(needles, tees=tees), seen.optics, seen.noise)
+    return _measured(film, bits, found, replace(needles, tees=tees), mine.junctions, seen.optics, seen.noise)
 
 
 def _of_sign(candidates: Candidates, sign: int) -> Candidates:
@@ -183,7 +183,7 @@ def _find_balls(
 
 
 def _measured(
-    film: NDArray[Any], bits: int, found: _Balls, needles: _Needles, optics: Optics, noise: NoiseModel
+    film: NDArray[Any], bits: int, found: _Balls, needles: _Needles, junctions: Float, optics: Optics, noise: NoiseModel
 ) -> tuple[MarkerImages, float]:
     """Where the marks are, with their errors and flags, and how much they speak for their polarity."""
     known, touching, painted, others = found.fits, found.touching, needles.painted, needles.all
@@ -214,7 +214,7 @@ def _measured(
     touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, by_size, touching, poor = balls.rows(keep), ratio[keep], by_size[keep], touching[keep], poor[keep]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
-    return table_of(film, bits, balls, under, ratio, by_size, touching, poor, others, optics, noise)
+    return table_of(film, bits, balls, under, ratio, by_size, touching, poor, others, junctions, optics, noise)
 
 
 def _nothing(cols: Float, _: Float) -> Float:

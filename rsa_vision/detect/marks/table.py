@@ -30,6 +30,7 @@ _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the 
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
 _UNLIKE = 2.0  # times the misfit that is usual on the film
 _FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these may be what is seen of a tee; radians
+_AT_TIP = 0.35  # of a pin's length, from its tip to where three arms meet
 _ROOM = 2.0  # standard deviations: nearer to an end of the range the mean of what is left of the noise is not that of the film
 
 
@@ -54,6 +55,7 @@ def table_of(
     touching: Bool,
     poor_ball: Bool,
     tees: list[NeedleFit],
+    junctions: Float,
     optics: Optics,
     noise: NoiseModel,
 ) -> tuple[MarkerImages, float]:
@@ -74,6 +76,8 @@ def table_of(
         Balls with something as dense beside them; balls that the model does not describe.
     tees : list of NeedleFit
         And pins.
+    junctions : ndarray of shape (k, 5)
+        Of their polarity, as of :func:`rsa_vision.detect.search.junctions.find_junctions`.
     optics : Optics
     noise : NoiseModel
 
@@ -112,7 +116,7 @@ def table_of(
     arms = np.array([len(t.angles) for t in tees])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
-    flags[n:][_perhaps_arms(tees)] |= MarkerFlag.UNLIKE
+    flags[n:][perhaps_arms(tees, junctions)] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
     unknown = ~np.isfinite(covariance).all(axis=(1, 2))
     poor |= unknown
@@ -141,18 +145,23 @@ def table_of(
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
 
 
-def _perhaps_arms(needles: list[NeedleFit]) -> Bool:
-    """Say which pins are parallel to an arm of the nearest tee, where they are few beside tees: an edge may hide the rest of one."""
+def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
+    """Say which pins may be what is seen of a tee: an edge may hide the rest.
+
+    Those at whose tips three arms meet, one of them along the pin, and those parallel to an arm of the nearest tee, where they are few.
+    """
     pin = np.array([len(f.angles) == 1 for f in needles], bool)
     tees = [f for f, single in zip(needles, pin, strict=True) if not single]
-    out = np.zeros(len(needles), bool)
-    if np.count_nonzero(pin) * _FEW_PINS > len(tees):
-        return out
     place = np.array([t.position_px for t in tees]).reshape(-1, 2)
+    few = 0 < np.count_nonzero(pin) * _FEW_PINS <= len(tees)
+    out = np.zeros(len(needles), bool)
     for k in np.flatnonzero(pin):
-        nearest = tees[int(np.hypot(*(place - needles[k].position_px).T).argmin())]
-        apart = np.angle(np.exp(1j * (nearest.angles - needles[k].angles[0])))
-        out[k] = np.abs(apart).min() < _PARALLEL
+        tip, angle = needles[k].position_px, needles[k].angles[0]
+        near = junctions[np.hypot(*(junctions[:, :2] - tip).T) < _AT_TIP * needles[k].shape.length_px]
+        arms = (near[:, 2, None] + [0.0, np.pi / 2, -np.pi / 2]).ravel()
+        if few:
+            arms = np.append(arms, tees[int(np.hypot(*(place - tip).T).argmin())].angles)
+        out[k] = np.abs(np.angle(np.exp(1j * (arms - angle)))).min(initial=np.inf) < _PARALLEL
     return out
 
 
