@@ -45,6 +45,7 @@ _ROUNDED = 1.0  # variance of noise up to which areas have one value
 _QUARTILE, _OF_CHANCE = 0.75, 2.773  # the upper one, of chi2 with two degrees of freedom: errors by bone have longer tails than it
 _BATCH = 20
 _USUAL = 6.0  # of chi2 with two degrees of freedom: 95 of 100 are less
+_OF_EDGE = 0.25  # how likely the edge is the better model, where surfaces do as well
 _AGREE = 3.0  # less than 1 / OF_SHIFT: by that part of the square in its variance every way back to the fit without the edge would be near
 _LEAST_CHANCE = 0.2  # of the variance by weights alone
 
@@ -128,6 +129,9 @@ def settle(
             chance = np.einsum("ni,ni->n", apart, np.linalg.solve(balls.covariance[part, :2, :2], apart[:, :, None])[:, :, 0])
             stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _AGREE) & (better < CHANCE))
             moved = free[part] & ~(edged[part] & stays)
+            # surfaces that bend as the film does elsewhere know more of an edge than the edge itself: either may be right
+            fits.covariance[edged[part], :2, :2] *= 1 - _OF_EDGE
+            fits.covariance[edged[part], :2, :2] += _OF_EDGE * out.covariance[part[edged[part]], :2, :2]
             out = _put(out, part, fits, moved)
             described = (fits.chi2_ring < _UNEVEN) & (fits.chi2_core < _DESCRIBED)
             clear_ones = np.flatnonzero(moved & described & (fits.valid_fraction > _WHOLE))
