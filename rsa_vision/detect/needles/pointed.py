@@ -35,6 +35,7 @@ _MOST_IN_VAIN = 60  # places in a row at which there are none
 _THICKER, _DIRECTIONS = 0.65, np.linspace(0, 2 * np.pi, 24, endpoint=False).tolist()  # of the length, where a pin answers the search most
 _ODD = 6.0  # half the chi2 by which chance makes a pin of the known size worse than a rod, or a pin, of free size
 _PALE = 0.5  # of the typical depth
+_ROUGHLY = 0.5  # of what a pin must have, for a closer look
 _OF_A_KIND = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
 
 
@@ -103,7 +104,7 @@ def _others_like(
             break
         tip, angles = _laid_over(film, place, typical, optics)
         first = fit_needles(film, tip, angles, typical.shape, optics, noise, quick=True, sized=True)
-        if first.significance < _PALE * _SIGNIFICANT or not explains(first, _PALE):
+        if first.significance < _ROUGHLY * _SIGNIFICANT or not explains(first, _ROUGHLY):
             continue
         at = (first.position_px, first.angles), _turned(first)
         best, other = sorted((fit_needles(film, *way, typical.shape, optics, noise, sized=True) for way in at), key=unexplained)
