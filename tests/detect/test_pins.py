@@ -91,7 +91,7 @@ def test_pins_of_a_film_tell_their_taper_together_where_noise_hides_it_in_each(s
 
 @pytest.mark.parametrize("seed", range(4))
 def test_pins_that_noise_hides_are_told_by_the_kind_of_the_clear_ones(seed: int) -> None:
-    """Of four and a half times the noise: one in six was lost, and its thick end passed for a ball."""
+    """Four and a half times as high as the noise: one in six was lost."""
     film, tips, _ = film_of_pins(np.random.default_rng(seed), quanta=32.0)
     images = detect_markers(film, bits=16).images
     assert images.shape.tolist() == ["pin"] * len(tips)

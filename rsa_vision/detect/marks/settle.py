@@ -129,7 +129,7 @@ def settle(
             chance = np.einsum("ni,ni->n", apart, np.linalg.solve(balls.covariance[part, :2, :2], apart[:, :, None])[:, :, 0])
             stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _AGREE) & (better < CHANCE))
             moved = free[part] & ~(edged[part] & stays)
-            # surfaces that bend as the film does elsewhere know more of an edge than the edge itself: either may be right
+            # surfaces that bend as the film does elsewhere promise more than they can at an edge: either model may be right
             fits.covariance[edged[part], :2, :2] *= 1 - _OF_EDGE
             fits.covariance[edged[part], :2, :2] += _OF_EDGE * out.covariance[part[edged[part]], :2, :2]
             out = _put(out, part, fits, moved)
