@@ -83,6 +83,8 @@ class NeedleFit:
         Largest difference from the background in its image; the depth is what full opacity would come to.
     blurrier : float
         Logarithm of its blur over that of the film: the penumbra grows with the distance from the film.
+    edged : bool
+        There is an edge in its background.
     """
 
     position_px: Float
@@ -103,6 +105,7 @@ class NeedleFit:
     slants: Float | None = None
     height: float = 0.0
     blurrier: float = 0.0
+    edged: bool = False
 
     def seen_by(self, optics: Optics) -> Optics:
         """Return a film's optics with the blur of this needle, on a grid that has tables of its own."""

@@ -13,6 +13,7 @@ from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.whitening import Filter
+from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.needles import Images, NeedleFit, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import PROMISING, between, explains, scored, step_of
@@ -21,7 +22,10 @@ from rsa_vision.types import Float, Int
 _STEPS, _QUICK_STEPS = 16, 5
 _CONVERGED_PX = 0.02  # a step's change: what is left after it is a tenth of that, and the last fit follows
 _NEAR_PX = 0.1  # enough for a first look
+_LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
 _AROUND_PX, _CLOSE_PX = 4.0, 1.0  # beyond three blurs from the arms, which tell the background; the same for a first look
+_OF_SURFACE, _INTERVALS = 6, 40  # terms of a background without an edge; between the knots of the profile of one, at the most
+_LEAST_SEEN = 1.0  # sum of squares, over the pixels, of a part of that
 _LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
 _GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
 
@@ -34,8 +38,8 @@ class Window:
     ----------
     cols, rows, data, beside : ndarray of shape (n,)
         Places on the film; its values, the images of neighbours taken away; those images.
-    surface : ndarray of shape (6, n)
-        Parts of a quadratic background.
+    surface : ndarray of shape (6, n), with an edge more
+        Parts of a quadratic background, the first of which is its level.
     half : int
         Half the side of the square around them.
     place : ndarray of int, shape (n,)
@@ -55,6 +59,22 @@ class Window:
     place: Int
     box: tuple[int, int]
     hidden: Float
+
+    def with_edge(self, needles: Sequence[NeedleFit], optics: Optics) -> Window:
+        """Return the window with the profiles of the strongest edge in its background, which is what is left without these needles.
+
+        They hold nothing of what the surface says already, so that its level stays the background's.
+        """
+        surface = self.surface[:_OF_SURFACE]
+        bare = self.data.copy()
+        for f in needles:
+            bare -= needle_image(self.cols - f.position_px[0], self.rows - f.position_px[1], f, optics)
+        bare -= np.linalg.lstsq(surface[:1].T, bare, rcond=None)[0] @ surface[:1]
+        box, seen = (self.boxes(values[None])[0].astype(np.float64) for values in (bare, np.ones(len(bare))))
+        edge = edge_profile(box, seen, optics.sigma_px, bent=True, intervals=_INTERVALS)[:, self.place]
+        edge = edge[np.square(edge).sum(axis=1) > _LEAST_SEEN]
+        edge -= np.linalg.lstsq(surface.T, edge.T, rcond=None)[0].T @ surface
+        return replace(self, surface=np.concatenate([surface, edge]))
 
     def filtered(self, values: Float, through: Filter) -> Float:
         """Filter values at the pixels, in units of the noise, shape (p, n)."""
@@ -120,6 +140,7 @@ def fit_crossing(
     others: Images | None = None,
     steps: int = _STEPS,
     quick: bool = False,
+    edge: bool = False,
 ) -> list[NeedleFit]:
     """Fit several pins or tees at once; the arms of each turn together.
 
@@ -136,6 +157,8 @@ def fit_crossing(
         At the most.
     quick : bool
         For a first look: few steps, and no step at all from starts that explain little of what neighbours leave.
+    edge : bool
+        The background also holds an edge, as of :meth:`Window.with_edge`.
 
     Returns
     -------
@@ -148,6 +171,8 @@ def fit_crossing(
     cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.half
     weight = 1.0 / noise.variance_at(data + window.beside)
     before, converged = now, False
+    if edge:
+        surface = window.with_edge(now, optics).surface
     tees: Float = np.zeros((len(now), 1, len(data)))  # needles, (image, its derivatives), pixels
     ground = np.zeros(len(data))  # background above its mean under each pixel
 
@@ -180,6 +205,9 @@ def fit_crossing(
         if step == 0 and quick and others is not None and not any(explains(f, PROMISING, 0.0) for f in told()):
             break
         delta = step_of(gram, theta, tees.shape[1] - 1, 1e-3 if step < 4 else 1e-6).reshape(len(now), -1)
+        if edge and step in _LOOKED_AGAIN:
+            deep = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta, strict=False)]
+            surface = window.with_edge(deep, optics).surface
         if step in (2, 6):
             weight = 1.0 / noise.variance_at(theta @ linear + window.beside)
         before, now = now, moved(now, delta, half)

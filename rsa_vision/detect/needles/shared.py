@@ -103,6 +103,7 @@ def fit_shared(
     parallel = parallel and len(needles[0].angles) > 1
     sets = clusters(needles)
     windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
+    windows = [w.with_edge(m, optics) if any(f.edged for f in m) else w for w, m in zip(windows, sets, strict=True)]
     of_blur = _UNEVEN_ERROR if any(optics.uneven) else _EVEN_ERROR
     errors = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, of_blur, of_blur, _SIZE_ERROR, _SIZE_ERROR]
     precision = np.diag(np.array(errors + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.balls.optics import CAP
-from rsa_vision.detect.balls.usual import proportion
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.covered import find_covered
 from rsa_vision.detect.needles.crossing import chi2_of, fit_crossing, moved, window_of
+from rsa_vision.detect.needles.edges import beside_edges, proportion_of
 from rsa_vision.detect.needles.ends import goes_on
 from rsa_vision.detect.needles.fits import explains, fit_needles
 from rsa_vision.detect.needles.optics import common_optics
@@ -26,14 +26,13 @@ from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fi
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.detect.needles.templates import SCALE, find_like, promising, template_of
 from rsa_vision.detect.needles.twins import split_twins
-from rsa_vision.detect.search.junctions import RINGS_PX
+from rsa_vision.detect.search.junctions import ALONE, RINGS_PX
 from rsa_vision.types import Float
 
 _BEFORE = 1.5  # tolerance before attenuation and ends are fitted
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
 _ASIDE, _ASKEW = 0.3, 0.6  # radians by which a junction may point aside; part that arms explain which lie between those of a tee
-_AROUND, _DIRECTIONS = 1.3, np.linspace(0, 2 * np.pi, 32, endpoint=False)  # lengths from a tip at which no arms are, on which sides
 _TURNED = 0.2  # radians, from which a tee is not like another
 _SAME_JUNCTION = 0.5  # of the length of its arms, from a junction to the tip fitted to it
 _MOST_JUNCTIONS = 80
@@ -43,6 +42,8 @@ _ACROSS = 1.5  # of the length of a tee, less what its image is wider by blur: a
 _TOUCHING = 1.05  # of the lengths of two tees, by which tips are apart whose arms reach each other; ends are blurred
 _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
+# by which tees of a set differ: logarithms of half width, which stands for depth, and of length, radians; part of them that do not more
+_ALIKE, _MOST_ALIKE = (0.35, 0.2, 0.15), 0.7
 _ASKED = 3  # cleanest tees that tell blur and taper
 _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 GUESS = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
@@ -71,6 +72,28 @@ def find_tees(
     optics : Optics
         With the attenuation that suits the arms: they are thinner than balls, and the film curve is bent.
     """
+    strong = np.abs(junctions[:, 4]) > ALONE
+    found = _found_from(film, junctions[strong], strokes, optics, noise)
+    if found[0] or strong.all():
+        return found
+    weak = _found_from(film, junctions, strokes, optics, noise)
+    return weak if _is_a_set([t for t in weak[0] if is_tee(t)]) else found
+
+
+def _is_a_set(tees: list[NeedleFit]) -> bool:
+    """Say whether there are several tees, most of them as large as each other and parallel: trabeculae are of any size."""
+    if len(tees) < _LEAST_PARALLEL:
+        return False
+    size = np.log([[t.shape.half_width_px, t.shape.length_px] for t in tees])
+    way = np.exp(1j * np.array([t.angles[0] for t in tees]))
+    apart = np.column_stack([size - np.median(size, axis=0), np.angle(way / (np.median(way.real) + 1j * np.median(way.imag)))])
+    like = (np.abs(apart) < _ALIKE).all(axis=1)
+    return bool(np.count_nonzero(like) >= max(_LEAST_PARALLEL, _MOST_ALIKE * len(tees)))
+
+
+def _found_from(
+    film: NDArray[Any], junctions: Float, strokes: Float, optics: Optics, noise: NoiseModel
+) -> tuple[list[NeedleFit], list[NeedleFit], Optics]:
     models, turned = _models(film, junctions, optics, noise)
     if not models:
         return [], [], optics
@@ -95,9 +118,9 @@ def find_tees(
         return [], [], optics
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
-    depth, background = (np.array([getattr(t, name) for t in nearly]) for name in ("depth", "background"))
-    beside = np.array([_beside(film, t, optics) for t in nearly])
-    optics = replace(optics, proportion=proportion(depth, background, beside).slope)
+    optics = replace(optics, proportion=proportion_of(film, nearly, optics))
+    tees, optics = beside_edges(film, tees, optics, noise, is_tee)
+    nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
     clean = [t for t in fitted if is_tee(t)]
@@ -115,14 +138,6 @@ def find_tees(
 def _apart(rough: list[NeedleFit], known: list[NeedleFit], gap_px: float) -> list[NeedleFit]:
     """Leave out rough fits to what is known by now."""
     return [t for t in rough if all(math.dist(t.position_px, k.position_px) > gap_px for k in known)]
-
-
-def _beside(film: NDArray[Any], tee: NeedleFit, optics: Optics) -> float:
-    """Value of the film around a tee, a median: it has no share in the errors of the fit."""
-    reach = _AROUND * tee.shape.length_px + 4 * optics.sigma_px
-    place = tee.position_px[:, None] + reach * np.array([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)])
-    cols, rows = (np.clip(np.rint(at).astype(np.intp), 0, size - 1) for at, size in zip(place, film.shape[::-1], strict=True))
-    return float(np.nanmedian(film[rows, cols]))
 
 
 def first_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> list[NeedleFit]:

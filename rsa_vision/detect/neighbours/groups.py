@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +14,7 @@ from rsa_vision.detect.balls.fits import BallFits, half_size, radii, uneven, une
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import columns, cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.whitening import whiten_rows
+from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.lapping import LEAST, lapping, product_image
 from rsa_vision.detect.models.profiles import ball_table
 from rsa_vision.types import Float
@@ -26,8 +25,6 @@ _MOST_PX, _LAST_PX = 0.5, 1.0  # of a step; of the last one, which is not held n
 _MOST_RADII = 0.12  # of a step, of large balls
 _ARRIVED = 12  # steps after which what still takes the longest ones is lost
 _LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
-_MOST_BENT = 1.0  # half windows to a radius
-KNOTS = 1.5  # blur widths between the knots of a profile across an edge
 
 
 def fit_group(
@@ -82,7 +79,7 @@ def fit_group(
     images = images_in(window, surface, local, radius, sigma_px, mu_px)
     theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     if edge:
-        surface = np.column_stack([surface, edge_profile(data - images.value.T @ theta[:k], valid, sigma_px)])
+        surface = columns([surface.T, window.edge(data - images.value.T @ theta[:k], sigma_px)])
         images = images_in(window, surface, local, radius, sigma_px, mu_px)
         theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     ground: Float | None = None
@@ -110,7 +107,7 @@ def fit_group(
                 ground = _under(images.value, surface @ theta[k : k + surface.shape[1]])
             if step in _LOOKED_AGAIN:
                 bare = data - images.linear[:, :k] @ theta[:k] - images.of_ground(theta)
-                surface = np.column_stack([window.surface, edge_profile(bare, valid, sigma_px, bent=bent)])
+                surface = columns([window.surface.T, window.edge(bare, sigma_px, bent=bent)])
         images = images_in(window, surface, local, radius, sigma_px, mu_px, ground)
         theta = weighted_least_squares(images.linear, weight, data, 1e-9)
     root = np.sqrt(weight)[:, None]
@@ -178,11 +175,11 @@ def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float,
     data = window.raw - window.neighbours
     images = images_in(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, sigma_px, mu_px)
     theta = weighted_least_squares(images.linear, weight, data)
-    edge = edge_profile(data - images.value.T @ theta[: len(fits.depth)], window.valid, sigma_px)
-    residual, jac = data - images.linear @ theta, columns([images.jacobian(theta).T, edge.T])
+    edge = window.edge(data - images.value.T @ theta[: len(fits.depth)], sigma_px)
+    residual, jac = data - images.linear @ theta, columns([images.jacobian(theta).T, edge])
     weighted = jac * np.sqrt(weight)[:, None]
     normal, right = weighted.T @ weighted, jac.T @ (weight * residual)
-    plain = slice(jac.shape[1] - edge.shape[1])
+    plain = slice(jac.shape[1] - len(edge))
     with_edge, without = (right[part] @ damped_solution(normal[part, part], right[part], 1e-9) for part in (slice(None), plain))
     return float(with_edge - without)
 
@@ -199,6 +196,11 @@ class GroupWindow:
     neighbours: Float
     valid: Float
     surface: Float  # (n, 6)
+
+    def edge(self, bare: Float, sigma_px: float, *, bent: bool = False) -> Float:
+        """Return profiles of the edge that the window shows without its marks (n,), shape (p, n)."""
+        box = (self.size, self.size)
+        return edge_profile(bare.reshape(box), self.valid.reshape(box), sigma_px, bent=bent)
 
     def left_by(self, basis: Float, noise: NoiseModel) -> tuple[Float, Float]:
         """Return what the best combination of the columns of ``basis`` leaves, and the weights of the pixels."""
@@ -287,54 +289,3 @@ def images_in(
     # a mark takes away its part of what is there: on linear films more beside an implant than behind it, on films of density as much
     linear = columns([value, surface.T, *([] if ground is None else [ground * value]), *products])
     return GroupImages(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, ground, pairs, of_pairs)
-
-
-def edge_profile(bare: Float, valid: Float, sigma_px: float, *, bent: bool = False) -> Float:
-    """Return functions that together make any smooth profile across the strongest edge of a window.
-
-    The edge of a bone or an implant is nearly a circle over the width of a window: it changes across, not along. A ball changes both
-    ways, so its centre stays determined, if less well across the edge; the covariance knows.
-
-    Parameters
-    ----------
-    bare : ndarray of shape (s * s,)
-        The window without its balls.
-    valid : ndarray of shape (s * s,)
-        1, or 0 where masked.
-    sigma_px : float
-        Blur of the film: nothing changes faster.
-    bent : bool
-        With direction and curvature of the gradients.
-
-    Returns
-    -------
-    ndarray of shape (s * s, p)
-        Cubic B-splines of the coordinate across the edge.
-    """
-    size = math.isqrt(len(bare))
-    bare, valid = bare.reshape(size, size), valid.reshape(size, size)
-    weight, smooth = (cv2.GaussianBlur(image, (9, 9), 1.0, borderType=cv2.BORDER_REFLECT) for image in (valid, bare * valid))
-    smooth = smooth / np.maximum(weight, 1e-6)
-    by_row, by_col = np.gradient(smooth)
-    inside = valid * (weight > 0.9)
-    by = np.stack([by_col, by_row]).reshape(2, -1)
-    tensor = (by * inside.ravel()) @ by.T
-    across = np.linalg.eigh(tensor)[1][:, 1]
-    steps = np.arange(size) - (size - 1) / 2
-    t, along = ((steps * x + (steps * y)[:, None]).ravel() for x, y in (across, (-across[1], across[0])))
-    if bent:  # around one centre gradients turn in proportion to the way along the edge
-        forward, aside = across @ by, np.array([-across[1], across[0]]) @ by
-        turn, bend = weighted_least_squares(np.stack([forward, forward * along], axis=1), inside.ravel(), aside)
-        most = 2 * _MOST_BENT / size
-        t += turn * along + 0.5 * np.clip(bend, -most, most) * along**2
-    step = max(KNOTS * sigma_px, (t.max() - t.min()) / 14)
-    place = (t - t.min()) / step
-    knot, n = place.astype(np.intp), len(t)
-    part = place - knot
-    # a spline reaches two knots to either side; those centred off the window are left out
-    splines = np.zeros((int(knot.max()) + 4, n))
-    of_four = ((1 - part) ** 3 / 6, 2 / 3 - part**2 + part**3 / 2, 2 / 3 - (1 - part) ** 2 + (1 - part) ** 3 / 2, part**3 / 6)
-    first = knot * n + np.arange(n)
-    for k, basis in enumerate(of_four):
-        splines.ravel()[first + k * n] = basis
-    return splines[1 : int(np.ceil(place.max() - 1e-9)) + 2].T

@@ -16,9 +16,10 @@ from rsa_vision.detect.balls.fits import BallFits, half_size, join, slopes
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut, damped_solution
 from rsa_vision.detect.film.whitening import whiten_rows
+from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.profiles import Optics, ball_table
 from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, all_but, groups_of, images_beside
-from rsa_vision.detect.neighbours.groups import edge_profile, fit_group, square
+from rsa_vision.detect.neighbours.groups import fit_group, square
 from rsa_vision.detect.neighbours.rims import goes_on
 from rsa_vision.types import Bool, Float
 
@@ -144,8 +145,8 @@ def _gains(film: NDArray[Any], at_px: Float, radius_px: float, optics: Optics, n
     explained = np.zeros((n, 4))
     for i, (col, row) in enumerate(patches.corner_px.tolist()):
         data = raw[i] - others(cols + col, rows + row)
-        line = edge_profile(data, valid[i], optics.sigma_px)
-        white = whiten_rows(np.concatenate([balls[i], surface.T, line.T, data[None]]) * root[i], patches.size, noise)
+        line = edge_profile(data.reshape(patches.size, -1), valid[i].reshape(patches.size, -1), optics.sigma_px)
+        white = whiten_rows(np.concatenate([balls[i], surface.T, line, data[None]]) * root[i], patches.size, noise)
         gram = white @ white.T  # holds the normal equations of any part of them
         explained[i] = [_explained(gram, part) for part in (slice(first, end), slice(end), slice(first, -1), slice(-1))]
     return np.asarray(explained[:, 1:] - explained[:, :1])

@@ -17,7 +17,7 @@ from rsa_vision.types import Float, Int
 
 RINGS_PX = (6.0, 9.0, 13.0, 19.0)  # film pixels; a tee shows on the rings that lie within its arms
 DIRECTIONS = 24
-LEAST = 1.5  # score, in units of what counts as significant
+LEAST, ALONE = 1.2, 1.5  # scores, in units of what counts as significant; a weaker one than that needs company
 _CHUNK = 8192  # points whose rings fit into the cache
 _APART = 4  # pixels of the answer; of junctions nearer than this, the best
 _GAP = 0.5  # between the arms the answer may reach this part of the weakest arm
