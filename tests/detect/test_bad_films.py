@@ -7,8 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
+from rsa_vision.flags import MarkerFlag
 
-from .films import stored
+from .films import film_of_balls, stored
 
 RNG = np.random.default_rng(1)
 FILMS = {
@@ -38,3 +39,22 @@ def test_noise_makes_no_more_false_detections_than_asked_for() -> None:
     rng = np.random.default_rng(4)
     films = [stored(20000 + 800 * rng.standard_normal((500, 500))) for _ in range(8)]
     assert sum(len(detect_markers(f, bits=16, false_detections=0.1).images) for f in films) <= 3  # 0.8 expected
+
+
+def test_balls_all_of_which_are_saturated_are_found_and_say_so() -> None:
+    """Specks that were whole told blur and polarity: not one of the balls was found."""
+    rng = np.random.default_rng(0)
+    axis = np.arange(40.0, 600.0, 100.0)
+    balls = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + rng.uniform(-8, 8, (36, 2))
+    clear = film_of_balls((600, 600), balls, np.full(36, 3.5), background=1.0, depth=0.5, sigma_px=1.1)
+    noise = gaussian_filter(rng.standard_normal(clear.shape), 0.7)
+    film = 1.3 - clear + 0.012 * noise / noise.std() + 0.05 * np.sin(np.arange(600) / 40)
+    images = detect_markers(stored(film / (0.3 + 0.3 * 0.475) * 4095, 12), bits=12).images
+    assert len(images.flags) == len(balls)
+    assert (images.flags & MarkerFlag.SATURATED).all()
+    nearest = np.hypot(*(images.position_px[:, None] - balls).transpose(2, 0, 1)).argmin(axis=1)
+    error = images.position_px - balls[nearest]
+    ratio = np.einsum("ni,nij,nj->n", error, np.linalg.inv(images.covariance_px2), error)
+    print(f"error / sd {np.sqrt(ratio.mean() / 2):.2f}, largest {np.sqrt(ratio.max()):.1f}")
+    assert 0.6 < np.sqrt(ratio.mean() / 2) < 1.2
+    assert ratio.max() < 4**2

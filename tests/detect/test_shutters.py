@@ -70,3 +70,24 @@ def test_edges_of_a_round_collimator_are_no_noise() -> None:
     gap = np.hypot(*(position[:, None] - found.position_px).transpose(2, 0, 1)).min(axis=1)
     print(f"RMS {np.sqrt((gap**2).mean() / 2):.4f} px")
     assert np.sqrt((gap**2).mean() / 2) < 0.02
+
+
+@pytest.mark.parametrize("blur_px", [0.0, 2.0])
+def test_a_frame_of_one_value_has_no_say_in_the_noise(blur_px: float) -> None:
+    """Of a value between those of the film: half of the balls were of no form that so little noise allows, others seven errors off."""
+    rng = np.random.default_rng(4)
+    balls, radii = grid_of_balls(rng, 5, 90.0, (3.5, 3.5))
+    balls = balls + 90.0
+    film = film_of_balls((660, 660), balls, radii, depth=0.4, noise_sd=450.0, noise_blur_px=0.6, gradient=(0.5, 0.4), rng=rng)
+    frame = np.ones((660, 660))
+    frame[60:600, 60:600] = 0.0
+    frame = gaussian_filter(frame, blur_px) if blur_px else frame
+    images = detect_markers(stored(frame * 40000 + (1 - frame) * film), bits=16).images
+    assert len(images.flags) == len(balls)
+    assert (images.flags == 0).all()
+    nearest = np.hypot(*(images.position_px[:, None] - balls).transpose(2, 0, 1)).argmin(axis=1)
+    error = images.position_px - balls[nearest]
+    ratio = np.einsum("ni,nij,nj->n", error, np.linalg.inv(images.covariance_px2), error)
+    print(f"error / sd {np.sqrt(ratio.mean() / 2):.2f}, largest {np.sqrt(ratio.max()):.1f}")
+    assert 0.7 < np.sqrt(ratio.mean() / 2) < 1.3
+    assert ratio.max() < 4**2

@@ -40,9 +40,9 @@ _SHORTER = 3  # attempts at a step that gains
 _ODD = 6.0  # three times what the two numbers of the optics gain by chance
 _SETTLED = 0.3  # standard deviations
 _MOST_TRIED, _MOST_SEEDS = 40, 40
-_WHOLE, _PARTLY, _INSIDE = 0.98, 0.8, 0.8  # of the pixels under a ball, and of its window
+_WHOLE, _INSIDE = (0.98, 0.8, 0.0), 0.8  # of the pixels under a ball, most first, and of its window
 _SURER = 3.0  # times the significance of what is a part of another
-_SPECKS = 0.5  # of the capped significance of the best
+_SPECKS = 0.5  # of all the evidence that there is
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
 _MUCH_MORE = 1.5  # times the variance
@@ -77,10 +77,11 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     if len(seeds.depth) == 0:
         return Optics(COARSE_SIGMA_PX, COARSE_MU_PX), 0.0
     # those that are whole tell most; not where they are specks beside balls of which noise or saturation takes a part
-    strength, inside = np.minimum(seeds.significance, CAP), seeds.window_fraction > _INSIDE
-    clear, partly = (inside & (seeds.valid_fraction > least) for least in (_WHOLE, _PARTLY))
-    if partly.any():
-        seeds = seeds.rows(clear if strength[clear].max(initial=0.0) > _SPECKS * strength[partly].max() else partly)
+    rest = np.maximum(misfit(seeds, noise) / MISFIT, (1 - explained_over_noise(seeds)) / (1 - EXPLAINED))
+    strength, inside = np.minimum(seeds.significance, CAP) * np.exp(-(rest**2)), seeds.window_fraction > _INSIDE
+    if inside.any():
+        tiers = (inside & (seeds.valid_fraction > least) for least in _WHOLE)
+        seeds = seeds.rows(next(t for t in tiers if strength[t].sum() >= _SPECKS * strength[inside].sum()))
     seeds = seeds.rows(~_within_others(seeds))
     noisy = _much_more_noise(seeds, noise)
     best = np.argsort(_closeness(seeds, noise, noisy))[:_MOST_TRIED]

@@ -32,6 +32,8 @@ _LEVELS = 12  # value classes of the variance curve
 _BEYOND = 12  # points by which it is carried on
 QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
 _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
+_BLANK = 0.5  # part of the pixels of a tile that are like the one beside them, in areas of one value
+_QUIET = 0.25  # of the tiles of a film, whose noise tells whether it has any
 _ROUNDED = 0.1  # of that: less is left by no noise
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
 
@@ -227,7 +229,12 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
 def _whole_tiles(film: NDArray[Any], side: int, floor: float, ceiling: float) -> NDArray[Any]:
     """Tiles that are nowhere saturated, shape (n, side, side)."""
     tiles = _tiles(film, side)
-    return np.asarray(tiles[(tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)])
+    whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
+    # shutters and frames of one value, amid those of the film, are no film where that has noise
+    blank = (tiles[:, :, 1:] == tiles[:, :, :-1]).mean((1, 2)) > _BLANK
+    if (whole & blank).any() and np.count_nonzero(whole & ~blank) >= ENOUGH_TILES:
+        whole &= ~blank | (np.quantile(_without_surfaces(tiles[whole & ~blank])[2], _QUIET) < _NO_NOISE)
+    return np.asarray(tiles[whole])
 
 
 def _without_surfaces(tiles: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], Float]:
