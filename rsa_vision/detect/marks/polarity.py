@@ -30,6 +30,7 @@ _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less t
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _RIVAL = 0.25  # of the evidence of the better polarity, from which the other is looked at as well
 _PERHAPS = 150.0  # evidence from which it is looked at even so, if the better one has shown none
+_ONE_BALL, _OF_PINS = CAP, 3 * CAP  # evidence of balls, up to which all may be a speck, and of pins, from which they know better
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: of marks it has next to none
 _REACH = 3.0  # of the radius of the ring on which a junction's arms are seen, that these reach
@@ -204,9 +205,11 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
         of_tees, needles = optics_of_tees(film, tees, under)
         if len(clear) or needles > balls:
             optics = of_tees
-        elif balls < _LEAST_EVIDENCE:
-            more = [p for p in look_for_pins(film, candidates.strokes, under) if np.sign(p.depth) == sign]
-            of_pins, needles = optics_of_pins(film, of_sign + more, under)
+    if not len(clear) and needles <= balls < _ONE_BALL:
+        more = [p for p in look_for_pins(film, candidates.strokes, under) if np.sign(p.depth) == sign]
+        of_pins, evidence = optics_of_pins(film, of_sign + more, under)
+        if balls < _LEAST_EVIDENCE or evidence > _OF_PINS:
+            needles = evidence
             if needles > 0 or not len(looks.depth):  # else even one faint ball knows more of its blur than nobody
                 optics = of_pins
     return Seen(sign, looks, optics, under, balls + needles + _of_tees(candidates, sign))

@@ -26,6 +26,7 @@ from rsa_vision.detect.needles.sets import others_beside
 
 _AROUND, _DIRECTIONS = 1.3, np.linspace(0, 2 * np.pi, 32, endpoint=False)  # lengths from a tip at which no arms are, on which sides
 _UNEVEN = 1.5  # variance beside the arms, in units of the noise, from which there is an edge
+_FEWEST = 60  # pixels beside arms that tell: ten times the terms of a surface
 _ROUNDS = 2  # of estimates of the proportion, from the edges that it makes better understood
 
 
@@ -100,6 +101,8 @@ def _beside(film: NDArray[Any], tee: NeedleFit, optics: Optics) -> float:
 def _is_uneven(window: Window, tee: NeedleFit, optics: Optics, noise: NoiseModel) -> bool:
     """Say whether no quadratic surface describes the film beside the arms of a tee: what their own form leaves lies under them."""
     free = ~under(needle_image(window.cols - tee.position_px[0], window.rows - tee.position_px[1], tee, optics))
+    if np.count_nonzero(free) < _FEWEST:
+        return False
     surface, data = window.surface[:, free].T, window.data[free]
     weight = 1.0 / noise.variance_at(data + window.beside[free])
     left = data - surface @ weighted_least_squares(surface, weight, data)
