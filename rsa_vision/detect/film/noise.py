@@ -33,6 +33,7 @@ _BEYOND = 12  # points by which it is carried on
 QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
 _NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
 _BLANK = 0.5  # part of the pixels of a tile that are like the one beside them, in areas of one value
+_OF_ONE_VALUE = 0.25  # part of such tiles that a frame has, all of them of its value
 _QUIET = 0.25  # of the tiles of a film, whose noise tells whether it has any
 _ROUNDED = 0.1  # of that: less is left by no noise
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
@@ -108,6 +109,17 @@ class NoiseModel:
         lag = np.arange(-LAGS, LAGS + 1)
         shared = np.exp(-(lag[:, None] ** 2 + lag**2) / (4 * np.square(spread_px)[..., None, None]))  # autocorrelation of the Gaussian
         return np.asarray((shared * self.correlation).sum((-2, -1)))
+
+    @property
+    def blur_px(self) -> float:
+        """Standard deviation of the Gaussian that has blurred what neighbouring pixels share; zero for white noise."""
+        first, second = self.correlation[LAGS, LAGS + 1 : LAGS + 3]
+        return float(np.sqrt(0.75 / np.log(first / second))) if first > second > 0 else 0.0
+
+    def blurred_by(self, blur_px: float) -> NoiseModel:
+        """Return noise of the same variance that a Gaussian of this standard deviation has blurred."""
+        lag = np.arange(-LAGS, LAGS + 1)
+        return replace(self, correlation=np.exp(-(lag[:, None] ** 2 + lag**2) / (4 * blur_px**2)))
 
     @property
     def is_white(self) -> bool:
@@ -230,10 +242,14 @@ def _whole_tiles(film: NDArray[Any], side: int, floor: float, ceiling: float) ->
     """Tiles that are nowhere saturated, shape (n, side, side)."""
     tiles = _tiles(film, side)
     whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
-    # shutters and frames of one value, amid those of the film, are no film where that has noise
-    blank = (tiles[:, :, 1:] == tiles[:, :, :-1]).mean((1, 2)) > _BLANK
-    if (whole & blank).any() and np.count_nonzero(whole & ~blank) >= ENOUGH_TILES:
-        whole &= ~blank | (np.quantile(_without_surfaces(tiles[whole & ~blank])[2], _QUIET) < _NO_NOISE)
+    # shutters and frames of one value, amid those of the film, are no film where that has noise; of film without noise, areas differ
+    blank = whole & ((tiles[:, :, 1:] == tiles[:, :, :-1]).mean((1, 2)) > _BLANK)
+    if blank.any():
+        value = np.median(tiles[blank], axis=(1, 2))
+        blank[blank] = (value[:, None] == value).mean(axis=1) > _OF_ONE_VALUE
+        rest = tiles[whole & ~blank]
+        if len(rest) >= ENOUGH_TILES and np.quantile(_without_surfaces(rest)[2], _QUIET) > _NO_NOISE:
+            whole &= ~blank
     return np.asarray(tiles[whole])
 
 

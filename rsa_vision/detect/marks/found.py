@@ -13,7 +13,7 @@ from rsa_vision.detect.balls.decide import LEAST_KNOWN, are_balls, faint_beside,
 from rsa_vision.detect.balls.find import MISFIT, STRENGTH, fit_at, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
-from rsa_vision.detect.balls.surroundings import free_places
+from rsa_vision.detect.balls.surroundings import Places, free_places
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.marks.noise_curve import noise_by_value
@@ -32,10 +32,13 @@ from rsa_vision.detect.neighbours.beside import images_beside, lapping_balls
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.neighbours.rims import goes_on
 from rsa_vision.detect.search.candidates import Candidates
-from rsa_vision.types import Bool, Float, MarkerImages
+from rsa_vision.types import Bool, Float, Int, MarkerImages
 
 _OVER, _PULL = 0.1, 0.1  # of the depth of a ball, from which a needle lies over it; of its radius, by which that moves its centre
 _AT_NEEDLES = 1.5  # of their lengths, from the tip: what the search answers to there is of a needle
+# nothing that blurs the noise of a film leaves its marks sharper than that: filters that smooth between edges do, and leave noise at these
+_SMOOTHED, _MUCH_MORE = 1.15, 2.0  # blur of the noise over that of the marks, noise under these over that beside them, from which one did
+_USUAL_BLUR = 0.6  # of the noise at marks, over theirs
 _BENT = 1.5  # of what a ball may leave, once an edge or bending surfaces around it could have taken it up
 
 
@@ -78,7 +81,12 @@ def marks_of(
     faint = _of_sign(faint, seen.sign)
     needles = _find_needles(film, mine, faint, candidates.strokes, rough_pins, seen)
     found, tees = _find_balls(film, mine, faint, needles, seen, limit, mottled=mottled)
-    return _measured(film, bits, found, replace(needles, tees=tees), mine.junctions, seen.optics, seen.noise)
+    needles = replace(needles, tees=tees)
+    around = _around(film, found, needles, seen.optics, seen.noise)
+    if around.under > _MUCH_MORE and seen.noise.blur_px > _SMOOTHED * seen.optics.sigma_px:
+        rougher = replace(seen, noise=seen.noise.blurred_by(_USUAL_BLUR * seen.optics.sigma_px))
+        return marks_of(film, bits, rougher, rough_pins, candidates, faint, limit, mottled=mottled)
+    return _measured(film, bits, found, needles, around, mine.junctions, seen.optics, seen.noise)
 
 
 def _of_sign(candidates: Candidates, sign: int) -> Candidates:
@@ -182,26 +190,41 @@ def _find_balls(
     return found, tees
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Around:
+    """Film around the balls, and what these say of its noise."""
+
+    places: list[Places]
+    free: Bool  # (n,): balls fitted alone
+    clear: Int  # those of them with nothing on them or beside them
+    under: float  # variance of the noise under balls, in units of that beside them
+
+
+def _around(film: NDArray[Any], found: _Balls, needles: _Needles, optics: Optics, noise: NoiseModel) -> _Around:
+    known, others = found.fits, needles.all
+    place = np.array([t.position_px for t in others]).reshape(-1, 2)
+    reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
+    places = free_places(film, known, place, reach, optics, noise)
+    free = ~found.touching & ~found.drawn
+    clear = np.flatnonzero(free & (known.valid_fraction > WHOLE) & (known.chi2_ring < STRUCTURE))
+    return _Around(places, free, clear, noise_under(known.chi2_uneven[clear], known.radius_px[clear], STRUCTURE, places, optics, noise))
+
+
 def _measured(
-    film: NDArray[Any], bits: int, found: _Balls, needles: _Needles, junctions: Float, optics: Optics, noise: NoiseModel
+    film: NDArray[Any], bits: int, found: _Balls, needles: _Needles, around: _Around, junctions: Float, optics: Optics, noise: NoiseModel
 ) -> tuple[MarkerImages, float]:
     """Where the marks are, with their errors and flags, and how much they speak for their polarity."""
     known, touching, painted, others = found.fits, found.touching, needles.painted, needles.all
+    free, clear, under = around.free, around.clear, around.under
 
     def beside(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
         return images_beside(known, np.array([i]), optics, painted, cols, rows)
 
-    place = np.array([t.position_px for t in others]).reshape(-1, 2)
-    reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
-    places = free_places(film, known, place, reach, optics, noise)
-    free = ~touching & ~found.drawn
-    clear = np.flatnonzero(free & (known.valid_fraction > WHOLE) & (known.chi2_ring < STRUCTURE))
-    under = noise_under(known.chi2_uneven[clear], known.radius_px[clear], STRUCTURE, places, optics, noise)
     curve = noise_by_value(film, known.rows(clear), lambda i, *at: beside(int(clear[i]), *at), optics, noise)
     if curve is not None:
         known = replace(known, covariance=under * known.covariance, chi2_uneven=known.chi2_uneven / under)
         noise, under = curve, 1.0
-    balls, ratio, by_size, covered = settle(film, known, places, under, free, found.edged, beside, optics, noise)
+    balls, ratio, by_size, covered = settle(film, known, around.places, under, free, found.edged, beside, optics, noise)
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
         over = painted.under(balls.position_px, balls.radius_px) > _OVER * np.abs(balls.depth)
         touching, by_size = touching | over, by_size + over * (_PULL * balls.radius_px) ** 2
