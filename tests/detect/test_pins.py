@@ -180,6 +180,17 @@ def test_steeply_bent_curves_hide_no_pins() -> None:
     assert np.max(missed**2 / stated) < 4.0**2
 
 
+def test_one_speck_does_not_tell_the_blur_of_a_film_of_pins() -> None:
+    """It is sharper than any mark: with its blur none of them was a pin."""
+    film, tips, _ = film_of_pins(np.random.default_rng(1), taper=0.66)
+    rows, cols = np.mgrid[0:SIDE, 0:SIDE]
+    grain = np.clip(1.8 - np.hypot(cols - 160.3, rows - 160.8), 0, 1)
+    images = detect_markers(np.rint(film * (1 - 0.2 * grain)).astype(np.uint16), bits=16).images
+    pins = images.position_px[images.shape == "pin"]
+    assert len(pins) == len(tips)
+    assert (np.hypot(*(pins - tips[:, None]).transpose(2, 0, 1)).min(axis=1) < 1).all()
+
+
 def test_a_rod_is_no_pin() -> None:
     values, tips, _ = film_of_pins(np.random.default_rng(6), taper=0.0)
     found = detect_markers(values, bits=16).images

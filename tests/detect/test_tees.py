@@ -39,6 +39,14 @@ def test_arms_of_a_few_pixels_are_no_tee() -> None:
     assert not is_tee(replace(_TEE, shape=NeedleShape(1.6, 5.2)))
 
 
+def test_what_faint_junctions_seed_has_to_be_a_set() -> None:
+    alike = [replace(_TEE, angles=_TEE.angles + 0.02 * k, shape=NeedleShape(2.0 + 0.05 * k, 16.0)) for k in range(6)]
+    assert tees._is_a_set(alike)
+    assert not tees._is_a_set(alike[:4])
+    assert not tees._is_a_set([replace(t, angles=t.angles + 0.5 * k) for k, t in enumerate(alike)])
+    assert not tees._is_a_set([replace(t, shape=NeedleShape(0.6 * 1.5**k, 16.0)) for k, t in enumerate(alike)])  # as trabeculae are
+
+
 @pytest.mark.parametrize(("reach", "on"), [(17.0, False), (60.0, True)])
 def test_arms_that_go_on_beyond_their_ends_are_wires(reach: float, on: bool) -> None:
     rows, cols = np.mgrid[0:121, 0:121] - 60.0

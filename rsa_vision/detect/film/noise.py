@@ -380,7 +380,8 @@ def influence_covariance(influence: NDArray[Any], correlation: Float) -> Float:
     # to six digits, in half the time of double precision
     spectrum = rfft2(influence.astype(np.float32), s=size).reshape(*influence.shape[:-2], -1)
     weighted = (spectrum * _root_of_power(correlation.tobytes(), len(correlation), size)).view(np.float32)  # real and imaginary parts
-    return np.asarray(np.matmul(weighted, weighted.swapaxes(-1, -2)), np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # of what a fit knows nothing at all, the variance is beyond single precision
+        return np.asarray(np.matmul(weighted, weighted.swapaxes(-1, -2)), np.float64)
 
 
 def power_spectrum(correlation: Float, size: tuple[int, ...]) -> Float:
