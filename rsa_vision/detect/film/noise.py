@@ -36,6 +36,7 @@ _BLANK = 0.5  # part of the pixels of a tile that are like the one beside them, 
 _OF_ONE_VALUE = 0.25  # part of such tiles that a frame has, all of them of its value
 _QUIET = 0.25  # of the tiles of a film, whose noise tells whether it has any
 _ROUNDED = 0.1  # of that: less is left by no noise
+_ALL_BLURRED = 0.7  # part of the noise that is blurred, from which all of it is
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
 
 _GAP, _BEYOND_MARKS = 0.5, 0.6  # of the height of marks: a gap in the values of tiles, and how far away what lies behind it has to be
@@ -112,9 +113,12 @@ class NoiseModel:
 
     @property
     def blur_px(self) -> float:
-        """Standard deviation of the Gaussian that has blurred what neighbouring pixels share; zero for white noise."""
+        """Standard deviation of the Gaussian that has blurred it; zero where a part of it is white, and the rest may be structure."""
         first, second = self.correlation[LAGS, LAGS + 1 : LAGS + 3]
-        return float(np.sqrt(0.75 / np.log(first / second))) if first > second > 0 else 0.0
+        if not first > second > 0:
+            return 0.0
+        blur = float(np.sqrt(0.75 / np.log(first / second)))
+        return blur if first * np.exp(1 / (4 * blur**2)) > _ALL_BLURRED else 0.0
 
     def blurred_by(self, blur_px: float) -> NoiseModel:
         """Return noise of the same variance that a Gaussian of this standard deviation has blurred."""
