@@ -100,10 +100,11 @@ def _beside(film: NDArray[Any], tee: NeedleFit, optics: Optics) -> float:
 
 def _is_uneven(window: Window, tee: NeedleFit, optics: Optics, noise: NoiseModel) -> bool:
     """Say whether no quadratic surface describes the film beside the arms of a tee: what their own form leaves lies under them."""
-    free = ~under(needle_image(window.cols - tee.position_px[0], window.rows - tee.position_px[1], tee, optics))
+    image = needle_image(window.cols - tee.position_px[0], window.rows - tee.position_px[1], tee, optics)
+    free = ~under(image)
     if np.count_nonzero(free) < _FEWEST:
         return False
-    surface, data = window.surface[:, free].T, window.data[free]
-    weight = 1.0 / noise.variance_at(data + window.beside[free])
+    surface, data = window.surface[:, free].T, (window.data - image)[free]
+    weight = 1.0 / noise.variance_at((window.data + window.beside)[free])
     left = data - surface @ weighted_least_squares(surface, weight, data)
     return float(np.mean(weight * left**2)) > _UNEVEN
