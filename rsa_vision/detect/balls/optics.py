@@ -40,7 +40,7 @@ _SHORTER = 3  # attempts at a step that gains
 _ODD = 6.0  # three times what the two numbers of the optics gain by chance
 _SETTLED = 0.3  # standard deviations
 _MOST_TRIED, _MOST_SEEDS = 40, 40
-_WHOLE, _INSIDE = (0.98, 0.8, 0.0), 0.8  # of the pixels under a ball, most first, and of its window
+_WHOLE, _INSIDE = (0.98, 0.8), 0.8  # of the pixels under a ball, most first, and of its window
 _SURER = 3.0  # times the significance of what is a part of another
 _SPECKS = 0.5  # of all the evidence that there is
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
@@ -81,7 +81,7 @@ def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> t
     strength, inside = np.minimum(seeds.significance, CAP) * np.exp(-(rest**2)), seeds.window_fraction > _INSIDE
     if inside.any():
         tiers = (inside & (seeds.valid_fraction > least) for least in _WHOLE)
-        seeds = seeds.rows(next(t for t in tiers if strength[t].sum() >= _SPECKS * strength[inside].sum()))
+        seeds = seeds.rows(next((t for t in tiers if strength[t].sum() >= _SPECKS * strength[inside].sum()), inside))
     seeds = seeds.rows(~_within_others(seeds))
     noisy = _much_more_noise(seeds, noise)
     best = np.argsort(_closeness(seeds, noise, noisy))[:_MOST_TRIED]
