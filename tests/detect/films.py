@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from rsa_vision.types import Float, MarkerImages
+
 FINE = 5  # samples of a pixel along either axis
 ATTENUATION = 0.6  # per pixel of chord
 
@@ -80,3 +82,11 @@ def strip(
     inside = ((u > 0) & (u < length) & (np.abs(v) < width_px / 2)).reshape(high[1] - low[1], FINE, high[0] - low[0], FINE)
     out[low[1] : high[1], low[0] : high[0]] = gaussian_filter(inside.mean(axis=(1, 3)), sigma_px, mode="nearest")
     return out
+
+
+def misses(found: MarkerImages, balls: Float) -> tuple[Float, Float]:
+    """Return distances of balls from the nearest images, in pixels and in units of what is stated."""
+    gap = np.hypot(*(balls[:, None] - found.position_px[None]).transpose(2, 0, 1))
+    index = gap.argmin(axis=1)
+    error, covariance = found.position_px[index] - balls, found.covariance_px2[index]
+    return gap.min(axis=1), np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0]) / 2)

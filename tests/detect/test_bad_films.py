@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from rsa_vision.detect import detect_markers
 from rsa_vision.flags import MarkerFlag
 
-from .films import film_of_balls, stored
+from .films import film_of_balls, misses, stored
 
 RNG = np.random.default_rng(1)
 FILMS = {
@@ -52,9 +52,8 @@ def test_balls_all_of_which_are_saturated_are_found_and_say_so() -> None:
     images = detect_markers(stored(film / (0.3 + 0.3 * 0.475) * 4095, 12), bits=12).images
     assert len(images.flags) == len(balls)
     assert (images.flags & MarkerFlag.SATURATED).all()
-    nearest = np.hypot(*(images.position_px[:, None] - balls).transpose(2, 0, 1)).argmin(axis=1)
-    error = images.position_px - balls[nearest]
-    ratio = np.einsum("ni,nij,nj->n", error, np.linalg.inv(images.covariance_px2), error)
-    print(f"error / sd {np.sqrt(ratio.mean() / 2):.2f}, largest {np.sqrt(ratio.max()):.1f}")
-    assert 0.6 < np.sqrt(ratio.mean() / 2) < 1.2
-    assert ratio.max() < 4**2
+    away, z = misses(images, balls)
+    print(f"error / sd {np.sqrt((z**2).mean()):.2f}, largest {np.sqrt(2) * z.max():.1f}")
+    assert (away < 1).all()
+    assert 0.6 < np.sqrt((z**2).mean()) < 1.2
+    assert z.max() < 4 / np.sqrt(2)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.film.noise import QUANTISATION, NoiseModel
+from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.shoulder import Curve, curve_of, rounding, shown
+from rsa_vision.detect.film.tiles import QUANTISATION
 from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored

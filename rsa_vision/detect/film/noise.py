@@ -12,17 +12,16 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.special import chdtri
 
 from rsa_vision.detect.film.repairs import repaired_lines
+from rsa_vision.detect.film.tiles import ENOUGH_TILES, NO_NOISE, QUANTISATION, roughness, skewness, tiles_of, whole_tiles, without_surfaces
 from rsa_vision.types import Float, Int
 
 TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surface, large enough to hold correlated noise
-ENOUGH_TILES = 12  # that are nowhere saturated
-MARKS = 1.8  # times as much as that, and it is not even noise and texture
 STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, and with this power of the value
+MARKS = 1.8  # times as much as that, and it is not even noise and texture
 _OF_WHITE = 0.37  # roughness of white noise
 _CROWDED, _ONE_SIDED = 3.0, 0.5  # roughness and skewness of a film's tiles from which marks fill them, and smaller ones are asked
 _EVEN = 0.6  # roughness of the quietest of these up to which they tell
 _STRUCTURE = 8.0  # times as much variance as film of its fine noise has elsewhere: tiles of such a class lie on edges
-MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
 LAGS = 5  # correlation is followed to this distance in pixels
 _MOST_LOOKED_AT = 1500**2  # pixels that tell whether a film is saturated
 _MUCH, _SPECKS = 0.2, 0.2  # part of a film that its background is, part of the runs of pixels in it that are one pixel long
@@ -30,12 +29,8 @@ _ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many
 _TAIL = 16  # such distances are less than this part of the values
 _LEVELS = 12  # value classes of the variance curve
 _BEYOND = 12  # points by which it is carried on
-QUANTISATION = 1.0 / 12.0  # variance of rounding to whole values
-_NO_NOISE, _CALCULATED = 1.0, 1e-3  # less variance, in steps of the values, is no film's; part of the values to which one is exact
-_BLANK = 0.5  # part of the pixels of a tile that are like the one beside them, in areas of one value
-_OF_ONE_VALUE = 0.25  # part of such tiles that a frame has, all of them of its value
-_QUIET = 0.25  # of the tiles of a film, whose noise tells whether it has any
-_ROUNDED = 0.1  # of that: less is left by no noise
+_CALCULATED = 1e-3  # part of the values to which a film without noise is exact
+_ROUNDED = 0.1  # of the variance of rounding: less is left by no noise
 _ALL_BLURRED = 0.7  # part of the noise that is blurred, from which all of it is
 _WHITE = 0.03  # correlation with the nearest neighbours below which noise counts as white
 
@@ -107,9 +102,7 @@ class NoiseModel:
 
     def gain(self, spread_px: Float) -> Float:
         """Return the variance of a mean over Gaussians of these widths, in units of that of white noise."""
-        lag = np.arange(-LAGS, LAGS + 1)
-        shared = np.exp(-(lag[:, None] ** 2 + lag**2) / (4 * np.square(spread_px)[..., None, None]))  # autocorrelation of the Gaussian
-        return np.asarray((shared * self.correlation).sum((-2, -1)))
+        return np.asarray((_blurred(spread_px) * self.correlation).sum((-2, -1)))
 
     @property
     def blur_px(self) -> float:
@@ -122,8 +115,7 @@ class NoiseModel:
 
     def blurred_by(self, blur_px: float) -> NoiseModel:
         """Return noise of the same variance that a Gaussian of this standard deviation has blurred."""
-        lag = np.arange(-LAGS, LAGS + 1)
-        return replace(self, correlation=np.exp(-(lag[:, None] ** 2 + lag**2) / (4 * blur_px**2)))
+        return replace(self, correlation=_blurred(np.array(blur_px)))
 
     @property
     def is_white(self) -> bool:
@@ -203,17 +195,17 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     tiles = np.zeros((0, TILE, TILE))
     while sides and len(tiles) < ENOUGH_TILES:
         side = sides.pop(0)
-        tiles = _whole_tiles(film, side, floor, ceiling)
+        tiles = whole_tiles(film, side, floor, ceiling)
     if not len(tiles):
-        tiles = _tiles(film, side)
-    mean, rest, variance = _without_surfaces(tiles)
-    while sides and np.median(_roughness(tiles, variance)) > _CROWDED and abs(np.median(_skewness(rest))) > _ONE_SIDED:
-        smaller = _whole_tiles(film, sides.pop(0), floor, ceiling)
+        tiles = tiles_of(film, side)
+    mean, rest, variance = without_surfaces(tiles)
+    while sides and np.median(roughness(tiles, variance)) > _CROWDED and abs(np.median(skewness(rest))) > _ONE_SIDED:
+        smaller = whole_tiles(film, sides.pop(0), floor, ceiling)
         if len(smaller) < ENOUGH_TILES:
             break
-        of_smaller = _without_surfaces(smaller)
+        of_smaller = without_surfaces(smaller)
         between = np.argsort(of_smaller[2])[: max(ENOUGH_TILES, len(smaller) // 8)]  # the quietest
-        if np.median(_roughness(smaller[between], of_smaller[2][between])) < _EVEN:
+        if np.median(roughness(smaller[between], of_smaller[2][between])) < _EVEN:
             tiles, (mean, rest, variance) = smaller, of_smaller  # between crowded marks there is no room for large ones either
             break
     dof = tiles[0].size - 6  # of the surface
@@ -223,11 +215,11 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
         chosen = part[np.argsort(variance[part])][: max(3, len(part) // 4)]
         level.append(float(mean[chosen].mean()))
         curve.append(float(np.median(variance[chosen])))
-        rough.append(float(np.median(_roughness(tiles[chosen], variance[chosen]))))
+        rough.append(float(np.median(roughness(tiles[chosen], variance[chosen]))))
         quiet.append(chosen)
     ranked = np.argsort(level)
     # steps of one value are not how fine a film's noise is
-    finest = min((r for r, v in zip(rough, curve, strict=True) if v > _NO_NOISE), default=min(rough))
+    finest = min((r for r, v in zip(rough, curve, strict=True) if v > NO_NOISE), default=min(rough))
     ranked = ranked[np.array(rough)[ranked] < _STRUCTURE * max(finest, _OF_WHITE)]
     level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], QUANTISATION))
     clean = curve_array >= np.array(curve)[ranked] * 0.999
@@ -237,64 +229,21 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     independent = dof / max(float((correlation**2).sum()), 1.0)
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     # a film without noise is one that was calculated: no more exact than that
-    least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < _NO_NOISE else 0.0
+    least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < NO_NOISE else 0.0
     variance = np.maximum(curve_array / bias, max(QUANTISATION, least))
     return NoiseModel(level_array, variance, correlation, floor, ceiling, repaired_lines(film))
 
 
-def _whole_tiles(film: NDArray[Any], side: int, floor: float, ceiling: float) -> NDArray[Any]:
-    """Tiles that are nowhere saturated, shape (n, side, side)."""
-    tiles = _tiles(film, side)
-    whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
-    # shutters and frames of one value, amid those of the film, are no film where that has noise; of film without noise, areas differ
-    blank = whole & ((tiles[:, :, 1:] == tiles[:, :, :-1]).mean((1, 2)) > _BLANK)
-    if blank.any():
-        value = np.median(tiles[blank], axis=(1, 2))
-        blank[blank] = (value[:, None] == value).mean(axis=1) > _OF_ONE_VALUE
-        rest = tiles[whole & ~blank]
-        if len(rest) >= ENOUGH_TILES and np.quantile(_without_surfaces(rest)[2], _QUIET) > _NO_NOISE:
-            whole &= ~blank
-    return np.asarray(tiles[whole])
-
-
-def _without_surfaces(tiles: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], Float]:
-    """Medians of tiles (n,), what quadratic surfaces leave of them (n, p) and its variance (n,)."""
-    axis = np.linspace(-1, 1, tiles.shape[1])
-    gx, gy = np.meshgrid(axis, axis)
-    basis = np.linalg.qr(np.stack([b.ravel() for b in (np.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy)], axis=1))[0]
-    flat = tiles.reshape(len(tiles), -1)
-    mean = medians(flat)  # a mark in a tile must not make it a level of its own
-    rest = flat.astype(np.float32) - mean[:, None].astype(np.float32)  # single precision does once the level is off
-    single = basis.astype(np.float32)
-    rest -= (rest @ single) @ single.T
-    return mean, rest, np.einsum("ij,ij->i", rest, rest).astype(np.float64) / (flat.shape[1] - basis.shape[1])
-
-
-def _roughness(tiles: NDArray[Any], variance: Float) -> Float:
-    """Variance of tiles over what second differences, which edges in them hardly change, make of it, shape (n,)."""
-    some = tiles[:, ::2].astype(np.float32)
-    bend = np.abs(some[:, :, 2:] - 2 * some[:, :, 1:-1] + some[:, :, :-2])
-    return np.asarray(variance / np.maximum(medians(bend.reshape(len(tiles), -1)) ** 2, QUANTISATION), np.float64)
-
-
-def _skewness(rest: NDArray[Any]) -> Float:
-    """Skewness of what surfaces leave of tiles (n, p): marks are all darker, or all brighter, than what is between them."""
-    spread = np.sqrt(np.mean(np.square(rest), axis=1, dtype=np.float64))
-    return np.asarray(np.mean(rest**3, axis=1, dtype=np.float64) / np.maximum(spread, 1e-9) ** 3)
+def _blurred(blur_px: Float) -> Float:
+    """Return the correlation of noise that Gaussians of these widths have blurred, one more table for each."""
+    lag = np.arange(-LAGS, LAGS + 1)
+    return np.asarray(np.exp(-(lag[:, None] ** 2 + lag**2) / (4 * np.square(blur_px)[..., None, None])))
 
 
 def _lag_zero() -> Float:
     """Return the correlation of white noise."""
     at_zero = (np.arange(-LAGS, LAGS + 1) == 0).astype(np.float64)
     return np.asarray(np.outer(at_zero, at_zero))
-
-
-def medians(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the medians along the last axis: those of numpy, which looks for NaN besides, in a tenth of the time."""
-    half = values.shape[-1] // 2
-    parted = np.partition(values, half)
-    upper = parted[..., half]
-    return np.asarray(upper if values.shape[-1] % 2 else upper / 2 + parted[..., :half].max(-1) / 2)
 
 
 def _smooth(level: Float, variance: Float) -> Float:
@@ -310,14 +259,6 @@ def _smooth(level: Float, variance: Float) -> Float:
             else:
                 out[k] = min(out[k], most)
     return out
-
-
-def _tiles(film: NDArray[Any], side: int) -> NDArray[Any]:
-    """Tiles spread evenly over a film, shape (n, side, side)."""
-    n_rows, n_cols = film.shape[0] // side, film.shape[1] // side
-    step = max(1, int(np.ceil(np.sqrt(n_rows * n_cols / MAX_TILES))))
-    tiles = film[: n_rows * side, : n_cols * side].reshape(n_rows, side, n_cols, side)[::step, :, ::step].swapaxes(1, 2)
-    return tiles.reshape(-1, side, side)
 
 
 def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:
@@ -357,7 +298,7 @@ def _smooth_correlation(auto: Float) -> tuple[Float, float]:
     part = min(alpha / (1 + beta), 1.0)
     if part < _WHITE:
         return (square == 0).astype(np.float64), 0.0
-    correlation = part * np.exp(-square / (4 * sigma**2))
+    correlation = part * _blurred(np.array(sigma))
     correlation[LAGS, LAGS] = 1.0
     return correlation, beta
 

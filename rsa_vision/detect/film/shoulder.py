@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from rsa_vision.detect.film.noise import QUANTISATION, NoiseModel, medians
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.tiles import QUANTISATION, medians
 from rsa_vision.types import Float
 
 _MOST_LOOKED_AT = 1500**2  # pixels that tell between which values a film's curve runs

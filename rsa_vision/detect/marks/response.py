@@ -12,7 +12,8 @@ from rsa_vision.detect.balls.decide import LEAST_KNOWN, look_clear
 from rsa_vision.detect.balls.find import fit_at
 from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.balls.optics import estimate_optics
-from rsa_vision.detect.film.noise import QUANTISATION, NoiseModel
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.tiles import QUANTISATION
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float, MarkerImages
 

@@ -8,7 +8,7 @@ import numpy as np
 from rsa_vision.detect.film.patches import weighted_least_squares
 from rsa_vision.types import Float
 
-KNOTS = 1.5  # blur widths between the knots of a profile across an edge
+_KNOTS = 1.5  # blur widths between the knots of a profile across an edge
 _INTERVALS = 14  # between them at the most, of balls
 _MOST_BENT = 1.0  # half windows to a radius
 
@@ -51,7 +51,7 @@ def edge_profile(bare: Float, valid: Float, sigma_px: float, *, bent: bool = Fal
         turn, bend = weighted_least_squares(np.stack([forward, forward * along], axis=1), inside.ravel(), aside)
         most = 2 * _MOST_BENT / max(bare.shape)
         t += turn * along + 0.5 * np.clip(bend, -most, most) * along**2
-    step = max(KNOTS * sigma_px, (t.max() - t.min()) / intervals)
+    step = max(_KNOTS * sigma_px, (t.max() - t.min()) / intervals)
     place = (t - t.min()) / step
     knot, n = place.astype(np.intp), len(t)
     part = place - knot

@@ -276,8 +276,7 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
     """
     seen = _Seen.of(dx.ravel(), dy.ravel(), fit.angles, fit.shape, fit.seen_by(optics))
     values, _ = seen.values(fit.shape, fit.slants, slopes=False)
-    image: Float = (fit.depths @ seen.spread([values])[0]).reshape(dx.shape)
-    return image
+    return np.asarray((fit.depths @ seen.spread([values])[0]).reshape(dx.shape))
 
 
 def arm_images(

@@ -69,8 +69,7 @@ class Window:
         bare = self.data.copy()
         for f in needles:
             bare -= needle_image(self.cols - f.position_px[0], self.rows - f.position_px[1], f, optics)
-        bare -= np.linalg.lstsq(surface[:1].T, bare, rcond=None)[0] @ surface[:1]
-        box, seen = (self.boxes(values[None])[0].astype(np.float64) for values in (bare, np.ones(len(bare))))
+        box, seen = (self.boxes(values[None])[0].astype(np.float64) for values in (bare - bare.mean(), np.ones(len(bare))))
         edge = edge_profile(box, seen, optics.sigma_px, bent=True, intervals=_INTERVALS)[:, self.place]
         edge = edge[np.square(edge).sum(axis=1) > _LEAST_SEEN]
         edge -= np.linalg.lstsq(surface.T, edge.T, rcond=None)[0].T @ surface

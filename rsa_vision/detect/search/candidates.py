@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.film.noise import NoiseModel, medians
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.tiles import medians
 from rsa_vision.detect.search.junctions import find_junctions
 from rsa_vision.detect.search.strokes import COLUMNS, find_strokes, where_three_meet
 from rsa_vision.types import Float, Int
