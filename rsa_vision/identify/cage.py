@@ -192,15 +192,15 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
         if among.sum() < LEAST_IMAGES:
             continue
         _weigh(namings, scene, seen, log_room, find_hypotheses(scene, seen.xy_mm[among], reading.turn_deg, missing, limits))
-        complete = any((naming.image[scene.own] >= 0).mean() > enough_for_all for naming in namings)
-        if namings and not complete:
-            best = max(namings, key=lambda n: n.log_evidence)
+        complete, moved_from = _is_complete(namings, scene, enough_for_all), None
+        while namings and not complete and moved_from is not (best := max(namings, key=lambda n: n.log_evidence)):
             # once more from where it settled: what drew a focus aside at first, and kept its marks from their images, may do so no longer
             again = name_marks(scene, best.fit.parameters, seen, log_room)
             if again and again.log_evidence > best.log_evidence:
                 namings.append(again)
                 best = again
             _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters, limits))
+            moved_from = best  # what is better than that may look like itself, moved, as well
         enough = any((naming.image[scene.own] >= 0).mean() > HALF for naming in namings)
         if enough or not misread or among.all():
             result = _decide(answer, scene, namings, seen, limits, log_room)
@@ -208,6 +208,10 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
         if complete or sure or (result and not misread) or among.all():
             break
     return result
+
+
+def _is_complete(namings: list[Naming], scene: Scene, enough: float) -> bool:
+    return any((naming.image[scene.own] >= 0).mean() > enough for naming in namings)
 
 
 def _weigh(namings: list[Naming], scene: Scene, seen: FilmImages, log_room: float, starts: list[Float]) -> None:

@@ -15,7 +15,7 @@ from rsa_vision.identify.cage import CageIdentification, identify_cage
 from rsa_vision.identify.film_model import build_scene
 from rsa_vision.identify.hypotheses import largest_overlap
 from rsa_vision.types import MarkerImages
-from synthetic.point_films import FilmTruth, expose, random_exposure, random_foci
+from synthetic.point_films import FilmTruth, expose, random_exposure, random_foci, random_objects
 
 EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "60"))  # of each cage; thousands take minutes
 
@@ -310,6 +310,21 @@ def test_hidden_end_columns_with_other_foci_are_ambiguous() -> None:
         result = identify(replace(film, images=film.images.rows(kept)), cage, (1, 2))
         assert "cage-ambiguous" in result.reasons, f"seed {seed}"
         assert result.runner_up
+
+
+def test_what_a_move_by_a_mark_finds_is_moved_again() -> None:
+    """Half the columns off the film, the foci 12 cm from nominal: of all first hypotheses the best is two columns from the truth."""
+    cage, rng = load_cage("1B-420"), np.random.default_rng([979, 2])
+    rng.random()
+    objects = random_objects(cage, int(rng.integers(5, 21)), rng, hidden=float(rng.choice([0.0, 0.02, 0.1])))
+    rng.random()
+    foci_mm = random_exposure(rng, cage).foci_mm
+    rng.random()
+    rng.choice([0.0, 0.005, 0.01])
+    film = expose(cage, (1, 2), random_exposure(rng, cage, foci_mm=foci_mm, pitch_mm=0.1, false_images=0, slack_mm=0.0), rng, objects)
+    result = identify(film, cage, (1, 2))
+    assert result
+    assert film.errors(result.assignments) == []
 
 
 def test_hidden_end_column_of_long_rows_is_weighed_too() -> None:
