@@ -18,7 +18,7 @@ from rsa_vision.detect.marks.found import marks_of
 from rsa_vision.detect.marks.polarity import first_looks, is_mottled, polarities
 from rsa_vision.detect.marks.response import BITS, high_balls, in_film_values, is_straighter, log_odds
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.pins import MOST_STROKES, look_for_pins
+from rsa_vision.detect.needles.first_pins import MOST_STROKES, look_for_pins
 from rsa_vision.detect.search.candidates import find_candidates
 from rsa_vision.detect.search.strokes import at_junctions
 from rsa_vision.threads import in_one_thread

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.crowd import out_of_a_crowd
-from rsa_vision.detect.balls.decide import LEAST_KNOWN, are_balls, faint_beside, look_clear, show_what_marks_are_like
-from rsa_vision.detect.balls.find import MISFIT, STRENGTH, fit_at, plausible
+from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, are_balls, faint_beside, look_clear, show_what_marks_are_like
+from rsa_vision.detect.balls.find import MISFIT, ROUNDNESS, STRENGTH, fit_at, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
@@ -25,7 +25,8 @@ from rsa_vision.detect.marks.table import WHOLE, table_of, what_is_left
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.pins import find_pins, look_for_pins
+from rsa_vision.detect.needles.first_pins import look_for_pins
+from rsa_vision.detect.needles.pins import find_pins
 from rsa_vision.detect.needles.sets import is_located, on_arms
 from rsa_vision.detect.needles.tees import find_tees, is_tee
 from rsa_vision.detect.neighbours.beside import images_beside, lapping_balls
@@ -39,6 +40,7 @@ _AT_NEEDLES = 1.5  # of their lengths, from the tip: what the search answers to 
 # nothing that blurs the noise of a film leaves its marks sharper than that: filters that smooth between edges do, and leave noise at these
 _SMOOTHED, _MUCH_MORE = 1.15, 2.0  # blur of the noise over that of the marks, noise under these over that beside them, from which one did
 _USUAL_BLUR = 0.6  # of the noise at marks, over theirs
+_BESIDE = 2.0, 3.0  # of the radius of a ball, and pixels more, within which the search answers to it
 _BENT = 1.5  # of what a ball may leave, once an edge or bending surfaces around it could have taken it up
 
 
@@ -122,10 +124,18 @@ def _find_needles(
     more_pins = look_for_pins(film, all_strokes[~on_arms(all_strokes[:, :2], perhaps)], noise)
     rough_pins = [p for p in rough_pins + more_pins if np.sign(p.depth) == sign]
     places = _likeliest_first(faint)
-    pins, pin_optics = find_pins(film, rough_pins, places[~on_arms(places, perhaps)], perhaps, optics, noise)
+    lines = _long_places(mine, seen.looks)
+    pins, pin_optics = find_pins(film, rough_pins, places[~on_arms(places, perhaps)], lines, perhaps, sign, optics, noise)
     pins = [p for p in pins if is_located(p)]
     painted = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
     return _Needles(tees, pins, doubtful, tee_optics, off_pins(seen.looks, more_pins), painted)
+
+
+def _long_places(mine: Candidates, looks: BallFits) -> Float:
+    """Places (n, 2) at which the search answers along a line, likeliest first, less those at balls."""
+    places, balls = _likeliest_first(mine.rows(mine.roundness < ROUNDNESS)), looks.rows(looks.explained > CLOSE)
+    gap = np.hypot(*(places[:, None] - balls.position_px).transpose(2, 0, 1))
+    return np.asarray(places[(gap > _BESIDE[0] * balls.radius_px + _BESIDE[1]).all(axis=1)])
 
 
 def _likeliest_first(candidates: Candidates) -> Float:

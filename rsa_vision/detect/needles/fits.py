@@ -73,7 +73,7 @@ def fit_needles(
     cols, rows = cols + corner[0], rows + corner[1]
     tip, angles = tip_px.astype(np.float64).copy(), angles.astype(np.float64).copy()
     if len(data) < 30 + 6 + 2 * len(angles):
-        return _unfit(tip, angles, shape)
+        return unfit(tip, angles, shape)
     surface = polynomial(half, cols - tip_px[0], rows - tip_px[1]).T
     weight = np.full(len(data), 1.0 / float(noise.variance_at(np.array([data.mean()]))[0]))
     converged, free = False, [1, 2, 5] if sized else [1, 2, 3, 4, 5]
@@ -100,12 +100,12 @@ def fit_needles(
         angles += scale * delta[4]
         converged = step > 0 and bool(np.abs(delta[:2]).max() < close)
         if np.hypot(*(tip - tip_px)) > 0.6 * half:
-            return _unfit(tip, angles, shape)
+            return unfit(tip, angles, shape)
     image, residual = theta[0] * linear[0], data - theta @ linear
     ring = ~under(image)
     background = float(theta[1])
     fit = replace(
-        _unfit(tip, angles, shape),
+        unfit(tip, angles, shape),
         depths=np.full(len(angles), theta[0]),
         chi2_ring=float((weight * residual**2)[ring].sum() / max(int(ring.sum()) - _MOVES - len(linear), 1)),
         converged=converged,
@@ -227,7 +227,8 @@ def explains(fit: NeedleFit, least: float, stands_out: float = STANDS_OUT, by_ch
     return bool(fit.explained > least or (raised > 1.0 and over_noise > least and significance > stands_out))
 
 
-def _unfit(tip: Float, angles: Float, shape: NeedleShape) -> NeedleFit:
+def unfit(tip: Float, angles: Float, shape: NeedleShape) -> NeedleFit:
+    """Return a pin or tee that no fit has seen: without depth, explaining nothing."""
     nan = float("nan")
     return NeedleFit(
         tip, angles, shape, np.zeros(len(angles)), 0.0, nan, np.full((2, 2), nan), 0, np.inf, np.inf, 0.0, 0.0, np.inf, 0.0, False

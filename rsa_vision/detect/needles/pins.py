@@ -1,4 +1,4 @@
-"""The single pins of a film: elongated islands of the filter's answer that a pointed pin explains and a rod does not."""
+"""The single pins of a film: what a pointed pin explains and a rod does not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
-from rsa_vision.detect.needles.fits import excess_of, explains, fit_needles, significant_misfit
+from rsa_vision.detect.needles.first_pins import distinct, likest_pins
+from rsa_vision.detect.needles.fits import excess_of, fit_needles, significant_misfit
+from rsa_vision.detect.needles.of_a_kind import are_alike, are_of_a_kind, odd_lengths, others_like
 from rsa_vision.detect.needles.optics import common_optics
 from rsa_vision.detect.needles.pointed import (
     EXPLAINED,
@@ -24,71 +26,35 @@ from rsa_vision.detect.needles.pointed import (
     is_pin,
     middle,
     pointed,
-    same_body,
+    points_one_way,
     standing_out,
+    turned,
     unexplained,
 )
-from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, on_arms
+from rsa_vision.detect.needles.sets import MOST_TOGETHER, TAPERS, fit_all, on_arms, others_beside
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.types import Bool, Float
 
 BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
-MOST_STROKES = 120  # strongest of a film, most of them seen by two filters
-_ROUGH = 0.85  # explained by a first look, with guessed optics
-_MOST_IN_VAIN = 20  # strokes in a row that are no pins
+_OTHER_BLURS_PX = BLURS_PX[1::2]  # of pins on films whose balls have another
 _KNOWN = 0.12  # of its length, to which the tip of a pin is known even at CNR 5: trabeculae are pointed anyhow
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length, by the fourth power of the curve, by it and the logarithm of the depth, by the others
 _OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.01, 0.05, 0.03, 2.0
-_AGAIN = 0.3  # part of a stroke's length within which another is the same
 _SAMPLE = 6
 _MOST_ASKED = 18  # for the optics that they have in common
-_CLOSE_FIT = 0.03  # misfit and what is not explained, of a pin whose taper is right
-
-
-def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list[NeedleFit]:
-    """Fit a pin either way round to each stroke with guessed optics, strongest first, and keep what may be one.
-
-    Parameters
-    ----------
-    film : ndarray of shape (rows, cols)
-    strokes : ndarray of shape (n, 6)
-        As of :func:`rsa_vision.detect.search.strokes.find_strokes`, strongest first.
-    noise : NoiseModel
-
-    Returns
-    -------
-    list of NeedleFit
-        Best first.
-    """
-    found: list[NeedleFit] = []
-    tried = np.zeros((0, 2))
-    in_vain = 0
-    guess = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
-    for col, row, angle, length, width, _ in strokes:
-        if (np.hypot(*(tried - [col, row]).T) < _AGAIN * length).any():
-            continue  # the same stroke, seen by another filter
-        tried = np.append(tried, [[col, row]], axis=0)
-        in_vain += 1
-        fits: list[NeedleFit] = []
-        for turn in (angle, angle + np.pi):
-            if fits and unexplained(fits[0]) < _CLOSE_FIT:
-                break
-            start = NeedleShape(max(0.9, 0.5 * width), 1.45 * length, TAPERS[0])  # the answer fades before the tip
-            tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
-            fits.append(fit_needles(film, tip, np.array([turn]), start, guess, noise, quick=True))
-        best = max(fits, key=lambda f: f.explained)
-        if explains(best, _ROUGH, STANDS_OUT_ROUGHLY):
-            found.append(best)
-            in_vain = 0
-        if in_vain == _MOST_IN_VAIN:
-            break
-    return _distinct(found)
 
 
 def find_pins(
-    film: NDArray[Any], rough: list[NeedleFit], places: Float, tees: list[NeedleFit], optics: Optics, noise: NoiseModel
+    film: NDArray[Any],
+    rough: list[NeedleFit],
+    places: Float,
+    long_places: Float,
+    tees: list[NeedleFit],
+    sign: int,
+    optics: Optics,
+    noise: NoiseModel,
 ) -> tuple[list[NeedleFit], Optics]:
     """Fit what may be single pins, and keep those that are.
 
@@ -96,11 +62,13 @@ def find_pins(
     ----------
     film : ndarray of shape (rows, cols)
     rough : list of NeedleFit
-        As of :func:`look_for_pins`, one polarity, perhaps of several looks.
-    places : ndarray of shape (n, 2)
-        Where others may be, (col, row), likeliest first.
+        As of :func:`rsa_vision.detect.needles.first_pins.look_for_pins`, one polarity, perhaps of several looks.
+    places, long_places : ndarray of shape (n, 2)
+        Where others may be, (col, row), likeliest first; where the search answers along a line, and no ball is seen.
     tees : list of NeedleFit
         Their arms are no single pins.
+    sign : int
+        Of depth.
     optics : Optics
     noise : NoiseModel
 
@@ -108,33 +76,54 @@ def find_pins(
     -------
     pins : list of NeedleFit
     optics : Optics
-        With the attenuation that suits the pins.
+        With the attenuation that suits the pins; where they are of a kind, with their blur, which beads between bones may not share.
     """
+    found = _found_from(film, rough, places, tees, [optics], noise)
+    if tees or are_of_a_kind(found[0]):
+        return found
+    likest = likest_pins(film, long_places, sign, noise)
+    if not are_alike([f for f in likest if is_pin(f, noise)]):
+        return found
+    trials = [optics, *(replace(optics, sigma_px=sigma) for sigma in _OTHER_BLURS_PX)]
+    more = _found_from(film, rough + likest, places, tees, trials, noise)
+    return more if are_of_a_kind(more[0]) else found
+
+
+def _found_from(
+    film: NDArray[Any], rough: list[NeedleFit], places: Float, tees: list[NeedleFit], trials: list[Optics], noise: NoiseModel
+) -> tuple[list[NeedleFit], Optics]:
+    """Find pins from first looks; ``trials``: what the film is known to be like, and what else it may be."""
+    known = trials[0]
     on_tees = on_arms(np.array([middle(f) for f in rough]).reshape(-1, 2), tees)
-    rough = _distinct([f for f, on in zip(rough, on_tees, strict=True) if not on])
+    rough = distinct([f for f, on in zip(rough, on_tees, strict=True) if not on])
     if not rough:
-        return [], optics
-    _, taper, sample = _likeliest(film, rough[:_SAMPLE], [optics], noise)
+        return [], known
+    optics, taper, sample = _likeliest(film, rough[:_SAMPLE], trials, noise)
     if not any(is_pin(f, noise) for f in sample):
-        return [], optics
+        return [], known
     optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
     more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
     optics = common_optics(film, [f for f in sample + more if is_pin(f, noise)], optics, noise)
     _, taper, sample = _likeliest(film, [f for f in sample if is_pin(f, noise)], [optics], noise)  # a wide blur feigns a short point
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
-    pins = [
-        min((_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes), key=unexplained)
-        for f, shapes in zip(rough, starts, strict=True)
-    ]
-    pins = pointed(film, _distinct([f for f in pins if is_pin(f, noise, STANDS_OUT_ROUGHLY)]), places, optics, noise)
-    pins = [f for f in fit_all(film, pins, optics, noise, again=MOST_TOGETHER) if is_pin(f, noise, STANDS_OUT_ROUGHLY)]
-    pins, optics = fit_shared(film, pins, optics, noise, parallel=False, alike=True)
+    fits = [[_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes] for f, shapes in zip(rough, starts, strict=True)]
+    pins = [min([*ways, *(_refit_turned(film, f, optics, noise) for f in ways)], key=unexplained) for ways in fits]
+    pins = pointed(film, distinct(_still(pins, noise)), optics, noise)
+    pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
+    # what pins have told of the film curve does not count twice: only their blur is where they begin
+    start = replace(optics, curve=known.curve, tail=known.tail, mu_px=known.mu_px)
+    pins, optics = fit_shared(film, pins, start, noise, parallel=False, alike=True)
+    if more := others_like(film, pins, places, optics, noise):
+        pins = _still(fit_all(film, [*pins, *more], optics, noise, again=MOST_TOGETHER), noise)
+        pins, optics = fit_shared(film, pins, replace(start, proportion=_proportion(pins)), noise, parallel=False, alike=True)
     if not tees:  # beside those a pin may be what is seen of one, and says so
         pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
         pins = pins if len(pins) >= LEAST_OF_A_KIND else standing_out(pins, noise)
+    pins = [f for f in pins if points_one_way(film, f, others_beside(f, [o for o in pins if o is not f], optics), optics, noise)]
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0
-    return [_less_sure_along(f, typical, optics, noise) for f in pins if is_pin(f, noise, STANDS_OUT_ROUGHLY)], optics
+    pins = _still(pins, noise)
+    return [_less_sure_along(f, typical, odd, optics, noise) for f, odd in zip(pins, odd_lengths(pins), strict=True)], optics
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
@@ -168,20 +157,25 @@ def _likeliest(
     """
     widest = max(trials, key=lambda optics: optics.sigma_px)
     windows = [window_of(film, [f], widest, noise, None) for f in sample]
+    pixels = np.array([len(window.data) for window in windows])
     fits, chi2 = {}, {}
+
+    def worse(left: Float, other: Float) -> float:
+        scale = np.maximum(np.minimum(left, other) / pixels, 1.0)
+        by = np.clip((left - other) / (2 * scale), -SURER_THAN_ROD, SURER_THAN_ROD)
+        return float((by / scale).sum())
+
     for optics in trials:
-        tried, last = sample, np.full(len(sample), np.inf)
+        tried, last = sample, None
         for taper in TAPERS:  # each from the one before: a cone is longer than the pin with a short point that it stands for
             tried = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in tried]
             left = np.array([chi2_of(window, f, optics, noise) for window, f in zip(windows, tried, strict=True)])
             fits[optics, taper], chi2[optics, taper] = tried, left
-            if np.mean(left > last) > 0.5:
+            if last is not None and worse(left, last) > 0:
                 break
             last = left
     least = np.min(list(chi2.values()), axis=0)
-    scale = 2 * np.maximum(least / [len(window.data) for window in windows], 1.0)
-    worse = {trial: float(np.minimum((left - least) / scale, SURER_THAN_ROD).sum()) for trial, left in chi2.items()}
-    best = min(worse, key=lambda trial: worse[trial])
+    best = min(chi2, key=lambda trial: worse(chi2[trial], least))
     return *best, fits[best]
 
 
@@ -205,6 +199,15 @@ def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
     return on
 
 
+def _still(pins: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
+    """Leave out what looks like none."""
+    return [f for f in pins if is_pin(f, noise, STANDS_OUT_ROUGHLY)]
+
+
+def _refit_turned(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
+    return fit_needles(film, *turned(fit), fit.shape, optics, noise)
+
+
 def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
     return fit_needles(film, fit.position_px, fit.angles, fit.shape, optics, noise)
 
@@ -220,24 +223,16 @@ def _proportion(pins: list[NeedleFit]) -> float:
     return float((b @ d + 0.5 * ratio / slack**2) / (b @ b + 1 / slack**2))
 
 
-def _less_sure_along(fit: NeedleFit, typical: float, optics: Optics, noise: NoiseModel) -> NeedleFit:
+def _less_sure_along(fit: NeedleFit, typical: float, odd_px: float, optics: Optics, noise: NoiseModel) -> NeedleFit:
     """Add an error along the pin: of film curve and blur as far as their models go, of what else lies there, of a point that is no cone.
 
-    ``typical`` is the depth of the film's pins. Across the pin there is nothing that these could move.
+    ``typical`` is the depth of the film's pins; ``odd_px`` as of :func:`odd_lengths`. Across the pin nothing of this could move it.
     """
     by_rest = _OF_MISFIT * significant_misfit(fit, noise) / np.sqrt(excess_of(fit, noise))  # by that the table widens all of it
     # where film responds more or less than usual, it is bent more or less as well
     unlike = abs(math.log(fit.depth / typical))
     by_model = np.array([_OF_CURVE * optics.curve[0] ** 4, _OF_UNLIKE * optics.curve[0] * unlike, _OF_TAIL * optics.tail, by_rest])
-    parts = [_POINT * fit.shape.half_width_px, *(fit.shape.length_px * by_model)]
+    parts = [odd_px, _POINT * fit.shape.half_width_px, *(fit.shape.length_px * by_model)]
     error_px = float(np.linalg.norm(parts))
     way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
     return replace(fit, covariance_px2=fit.covariance_px2 + error_px**2 * np.outer(way, way))
-
-
-def _distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
-    kept: list[NeedleFit] = []
-    for fit in sorted(pins, key=unexplained):
-        if all(math.dist(fit.position_px, k.position_px) > NEAREST_PX and not same_body(fit, k) for k in kept):
-            kept.append(fit)
-    return kept

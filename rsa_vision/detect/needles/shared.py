@@ -8,6 +8,7 @@ from one needle these are poor, from all of them they are good. Each needle's ow
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,7 @@ _CONVERGED = {1: 0.15, 3: 0.25}
 _FINEST_PX = 0.02  # added to those, for the tables are interpolated
 _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the needles are asked: they know better than balls
 _TAPER_ERROR = 0.1
+_SPOILT = 1.5  # times the chi2 of most pins: what leaves so much, on bone, tells nothing of what they have in common
 _SIZE_ERROR = 1.0  # of those, before
 _ASKED_AFTER = 4  # steps, after which it is asked at the latest how far arms and blurs differ: what differs does not converge
 _BLURS_AFTER, _MORE_STEPS = 3, 6
@@ -113,6 +115,7 @@ def fit_shared(
     sizes = Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     arms = regular(sets) if len(needles[0].angles) == ARMS else None
     at = State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, equal(sets), arms)
+    telling = _telling(sets, noise) if alike else [True] * len(sets)
     asked, asked_of_blurs, sizes_at = False, False, _SIZES_AFTER
     start, slopes, since, of_blurs = optics, list[list[Float]](), np.full(OPTICS, np.inf), at.own_blurs
     last: list[Equations | None] = [None] * len(sets)
@@ -132,7 +135,7 @@ def fit_shared(
             at, systems, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
             step, shorter, converged = step.shorter(), shorter + 1, False
         else:
-            told = [e.information() for e in systems]
+            told = [e.information() for e, tells in zip(systems, telling, strict=True) if tells]
             normal = held + sum(matrix for matrix, _ in told)
             target = np.sum([right for _, right in told], axis=0)
             if count == steps or converged:
@@ -176,7 +179,7 @@ def fit_shared(
             at, converged, least = replace(at, sizes=sizes_of(systems, at.sets)), False, np.inf
     through = _quietest(film, windows, systems, noise)
     systems = [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
-    told = [e.information() for e in systems]
+    told = [e.information() for e, tells in zip(systems, telling, strict=True) if tells]
     normal = precision + sum(matrix for matrix, _ in told)
     change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at.taper)
     step = Step(change, [e.step(change) for e in systems])
@@ -187,7 +190,7 @@ def fit_shared(
     # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
     under = at_rims(min(usual_square(left), 1.0)) if len(left) >= LEAST else 1.0
     by_noise = [_by_noise(window, e, through) for window, e in zip(windows, systems, strict=True)]
-    of_common = _common_errors(systems, by_noise, normal, precision, under)
+    of_common = _common_errors(list(compress(systems, telling)), list(compress(by_noise, telling)), normal, precision, under)
     out = []
     for window, e, members, scatter in zip(windows, systems, at.sets, by_noise, strict=True):
         out += _finished(window, e, members, under * scatter, of_common, optics, noise, converged)
@@ -196,6 +199,13 @@ def fit_shared(
     over = [louder(w, e, own, change, optics.sigma_px) for w, e, own in zip(windows, systems, step.own, strict=True)]
     more = _more(out, np.concatenate(by_ground), tips, over, noise)
     return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, more, strict=True)], optics
+
+
+def _telling(sets: list[list[NeedleFit]], noise: NoiseModel) -> list[bool]:
+    """Say which sets tell what is common: not those of which much more is left than of most."""
+    left = np.array([max(excess_of(f, noise) for f in m) for m in sets])
+    typical = np.sort(left)[: max(len(left) // 2, 1)].max()
+    return [bool(of < _SPOILT * typical) for of in left]
 
 
 def _odd(systems: list[Equations], at: State, gain: float) -> Regularity | None:

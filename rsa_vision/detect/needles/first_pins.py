@@ -1,0 +1,120 @@
+"""First looks at what may be single pins, with guessed optics: at strokes, and wherever a pin of any size looks like the film."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.fits import explains, fit_needles, unfit
+from rsa_vision.detect.needles.laid_over import laid_over
+from rsa_vision.detect.needles.pointed import STANDS_OUT_ROUGHLY, same_body, turned, unexplained
+from rsa_vision.detect.needles.sets import NEAREST_PX, TAPERS, on_arms
+from rsa_vision.types import Float
+
+MOST_STROKES = 120  # strongest of a film, most of them seen by two filters
+_GUESS = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
+ROUGH = 0.85  # explained by a first look, with guessed optics
+_MOST_IN_VAIN = 20  # strokes in a row that are no pins
+_AGAIN = 0.3  # part of a stroke's length within which another is the same
+_CLOSE_FIT = 0.03  # misfit and what is not explained, of a pin whose taper is right
+_WIDTHS_PX, _RATIOS = (1.5, 2.5, 4.0, 6.0), (9.0, 15.0)  # half widths that are laid over a film, and lengths over them
+_MOST_PLACES, _MOST_FOUND = 1000, 40
+_LIKENESS = 0.5  # correlation coefficient from which a place is worth a fit
+
+
+def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list[NeedleFit]:
+    """Fit a pin either way round to each stroke with guessed optics, strongest first, and keep what may be one.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    strokes : ndarray of shape (n, 6)
+        As of :func:`rsa_vision.detect.search.strokes.find_strokes`, strongest first.
+    noise : NoiseModel
+
+    Returns
+    -------
+    list of NeedleFit
+        Best first.
+    """
+    found: list[NeedleFit] = []
+    tried = np.zeros((0, 2))
+    in_vain = 0
+    for col, row, angle, length, width, _ in strokes:
+        if (np.hypot(*(tried - [col, row]).T) < _AGAIN * length).any():
+            continue  # the same stroke, seen by another filter
+        tried = np.append(tried, [[col, row]], axis=0)
+        in_vain += 1
+        fits: list[NeedleFit] = []
+        for turn in (angle, angle + np.pi):
+            if fits and unexplained(fits[0]) < _CLOSE_FIT:
+                break
+            start = NeedleShape(max(0.9, 0.5 * width), 1.45 * length, TAPERS[0])  # the answer fades before the tip
+            tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
+            fits.append(fit_needles(film, tip, np.array([turn]), start, _GUESS, noise, quick=True))
+        best = max(fits, key=lambda f: f.explained)
+        if explains(best, ROUGH, STANDS_OUT_ROUGHLY):
+            found.append(_best_tapered(film, best, noise))
+            in_vain = 0
+        if in_vain == _MOST_IN_VAIN:
+            break
+    return distinct(found)
+
+
+def likest_pins(film: NDArray[Any], places: Float, sign: int, noise: NoiseModel) -> list[NeedleFit]:
+    """Fit a pin of some size where one looks most like the film, with guessed optics, and keep what may be one.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    places : ndarray of shape (n, 2)
+        Where the search answers, (col, row), strongest first.
+    sign : int
+        Of depth.
+    noise : NoiseModel
+
+    Returns
+    -------
+    list of NeedleFit
+        Best first.
+    """
+    shapes = [NeedleShape(width, ratio * width, TAPERS[1]) for width in _WIDTHS_PX for ratio in _RATIOS]
+    pins = [replace(unfit(np.zeros(2), np.zeros(1), shape), depths=np.array([float(sign)])) for shape in shapes]
+    out: list[NeedleFit] = []
+    for start in laid_over(film, places[:_MOST_PLACES], pins, _GUESS):
+        if start.likeness < _LIKENESS or len(out) == _MOST_FOUND:
+            break
+        if on_arms(start.place[None], out).any():
+            continue
+        ways = (start.pin.position_px, start.pin.angles), turned(start.pin)
+        fits = [fit_needles(film, *way, start.pin.shape, _GUESS, noise, quick=True) for way in ways]
+        best = max(fits, key=lambda f: f.explained)
+        if explains(best, ROUGH, STANDS_OUT_ROUGHLY) and best.depth * sign > 0:
+            out.append(_best_tapered(film, best, noise))
+    return distinct(out)
+
+
+def distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
+    """Return one fit of every pin, best first."""
+    kept: list[NeedleFit] = []
+    for fit in sorted(pins, key=unexplained):
+        if all(math.dist(fit.position_px, k.position_px) > NEAREST_PX and not same_body(fit, k) for k in kept):
+            kept.append(fit)
+    return kept
+
+
+def _best_tapered(film: NDArray[Any], first: NeedleFit, noise: NoiseModel) -> NeedleFit:
+    """Fit with the other tapers as well: what is a cylinder with a short point is longer as a cone, and leaves more."""
+    fits = [first]
+    for taper in (t for t in TAPERS if t != first.shape.taper):
+        shape = replace(fits[-1].shape, taper=taper)
+        fits.append(fit_needles(film, fits[-1].position_px, fits[-1].angles, shape, _GUESS, noise, quick=True))
+    return min(fits, key=unexplained)

@@ -1,0 +1,145 @@
+"""Pins of the kind that a film's clear ones show.
+
+Noise may hide the point of a pin, and bone its form, not its size: where a film has shown a few clear ones, all that looks like them is
+asked whether it is one. Those on the edges of bones are fitted with the edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.crossing import fit_crossing
+from rsa_vision.detect.needles.fits import explains, fit_needles
+from rsa_vision.detect.needles.laid_over import laid_over
+from rsa_vision.detect.needles.pointed import (
+    LEAST_OF_A_KIND,
+    RATHER_THAN_TURNED,
+    SIGNIFICANT,
+    STANDS_OUT_ROUGHLY,
+    is_pin,
+    same_body,
+    surer_than_rod,
+    turned,
+    unexplained,
+    worse_by,
+)
+from rsa_vision.detect.needles.sets import on_arms
+from rsa_vision.types import Float
+
+_MOST_IN_VAIN = 60  # places in a row at which there are none
+_ROUGHLY = 0.5  # of what a pin must have, for a closer look
+_ODD = 6.0  # half the chi2 by which chance makes a pin of the known size worse than a rod, or a pin, of free size
+_PALE = 0.5  # of the typical depth
+# logarithms of half width and length: how far first looks of one kind differ, what is like the clear ones, and these among themselves (rms)
+_ROUGHLY_ALIKE, _ALIKE, _OF_A_KIND = 0.35, 0.12, 0.1
+_TELL, _SAME_LENGTH = 6, 0.05  # pins of a film that tell what is odd; logarithm of the lengths of one kind
+
+
+def others_like(film: NDArray[Any], known: list[NeedleFit], places: Float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Find at places the pins of the size of the clear ones.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    known : list of NeedleFit
+        Pins.
+    places : ndarray of shape (n, 2)
+        Where others may be, (col, row).
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    list of NeedleFit
+        None of the known ones; none at all if they would be more than these, which are not of one kind.
+    """
+    clear = [f for f in known if is_pin(f, noise)]
+    if len(clear) < LEAST_OF_A_KIND:
+        return []
+    width, length = np.exp(np.median(_log_sizes(clear), axis=0)).tolist()
+    typical = replace(
+        clear[0],
+        shape=replace(clear[0].shape, half_width_px=width, length_px=length),
+        depth=float(np.median([f.depth for f in clear])),
+        background=float(np.median([f.background for f in clear])),
+    )
+    out: list[NeedleFit] = []
+    in_vain = 0
+    for start in laid_over(film, places, [typical], optics):
+        if on_arms(start.place[None], [*known, *out]).any():
+            continue
+        in_vain += 1
+        if in_vain > _MOST_IN_VAIN:
+            break
+        found = _fit_like(film, start.pin, optics, noise)
+        if found and _is_like(film, found, typical, optics, noise) and not any(same_body(found, k) for k in (*known, *out)):
+            out.append(found)
+            in_vain = 0
+    return out if are_of_a_kind(clear) or len(out) <= len(known) else []
+
+
+def _fit_like(film: NDArray[Any], typical: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit | None:
+    """Fit a pin of the typical size, one of its own where noise allows no other, and with an edge where that is none; None for no pin."""
+    first = fit_needles(film, typical.position_px, typical.angles, typical.shape, optics, noise, quick=True, sized=True)
+    if first.significance < _ROUGHLY * SIGNIFICANT or not explains(first, _ROUGHLY):
+        return None
+    ways = (first.position_px, first.angles), turned(first)
+    best, other = sorted((fit_needles(film, *way, typical.shape, optics, noise, sized=True) for way in ways), key=unexplained)
+    if worse_by(film, best, other, optics, noise) < RATHER_THAN_TURNED:
+        return None
+    free = fit_needles(film, best.position_px, best.angles, typical.shape, optics, noise)
+    best = free if worse_by(film, best, free, optics, noise) < -_ODD else best
+    if is_pin(best, noise, STANDS_OUT_ROUGHLY):
+        return best
+    return replace(fit_crossing(film, [best], optics, noise, edge=True)[0], edged=True)
+
+
+def _is_like(film: NDArray[Any], fit: NeedleFit, typical: NeedleFit, optics: Optics, noise: NoiseModel) -> bool:
+    """Say whether a fit is a pin of the typical size and as deep, or of as large a part of what is there."""
+    deep = fit.depth / typical.depth
+    of_background = deep * max(typical.background, 1.0) / max(fit.background, 1.0)
+    return bool(
+        is_pin(fit, noise, STANDS_OUT_ROUGHLY)
+        and (np.abs(np.diff(_log_sizes([fit, typical]), axis=0)) < _ALIKE).all()
+        and any(_PALE < ratio < 1 / _PALE for ratio in (deep, of_background))
+        and (fit.edged or surer_than_rod(film, fit, optics, noise) > -_ODD)
+    )
+
+
+def are_alike(pins: list[NeedleFit]) -> bool:
+    """Say whether more first looks than make a kind are of about one size, so that they are worth another."""
+    if not pins:
+        return False
+    sizes = _log_sizes(pins)
+    return int((np.abs(sizes - np.median(sizes, axis=0)) < _ROUGHLY_ALIKE).all(axis=1).sum()) > LEAST_OF_A_KIND
+
+
+def are_of_a_kind(pins: list[NeedleFit]) -> bool:
+    """Say whether several pins are nearly as large as each other: trabeculae are of any size."""
+    return len(pins) >= LEAST_OF_A_KIND and bool((_log_sizes(pins).std(axis=0) < _OF_A_KIND).all())
+
+
+def odd_lengths(pins: list[NeedleFit]) -> list[float]:
+    """Return by how much each pin is longer or shorter than a film's pins, zero where there are others of its length, or none of a kind.
+
+    What ends elsewhere than the others do may begin elsewhere as well.
+    """
+    if len(pins) < _TELL:
+        return [0.0] * len(pins)
+    length = np.array([f.shape.length_px for f in pins])
+    apart = np.abs(np.log(length[:, None] / length))
+    alone = (apart < _SAME_LENGTH).sum(axis=1) < LEAST_OF_A_KIND
+    odd = alone if np.median(np.abs(np.log(length / np.median(length)))) < _SAME_LENGTH / 2 else np.zeros_like(alone)
+    return [float(by) if is_odd else 0.0 for by, is_odd in zip(np.abs(length - np.median(length)), odd, strict=True)]
+
+
+def _log_sizes(pins: list[NeedleFit]) -> Float:
+    """Logarithms of half widths and lengths, shape (n, 2)."""
+    return np.log([[f.shape.half_width_px, f.shape.length_px] for f in pins])
