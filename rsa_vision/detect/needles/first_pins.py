@@ -62,7 +62,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
             fits.append(fit_needles(film, tip, np.array([turn]), start, _GUESS, noise, quick=True))
         best = max(fits, key=lambda f: f.explained)
         if explains(best, ROUGH, STANDS_OUT_ROUGHLY):
-            found.append(_best_tapered(film, best, noise))
+            found.append(best)
             in_vain = 0
         if in_vain == _MOST_IN_VAIN:
             break
@@ -98,7 +98,7 @@ def likest_pins(film: NDArray[Any], places: Float, sign: int, noise: NoiseModel)
         fits = [fit_needles(film, *way, start.pin.shape, _GUESS, noise, quick=True) for way in ways]
         best = max(fits, key=lambda f: f.explained)
         if explains(best, ROUGH, STANDS_OUT_ROUGHLY) and best.depth * sign > 0:
-            out.append(_best_tapered(film, best, noise))
+            out.append(best_tapered(film, best, noise))
     return distinct(out)
 
 
@@ -111,8 +111,21 @@ def distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
     return kept
 
 
-def _best_tapered(film: NDArray[Any], first: NeedleFit, noise: NoiseModel) -> NeedleFit:
-    """Fit with the other tapers as well: what is a cylinder with a short point is longer as a cone, and leaves more."""
+def best_tapered(film: NDArray[Any], first: NeedleFit, noise: NoiseModel) -> NeedleFit:
+    """Fit with the other tapers as well: what is a cylinder with a short point is longer as a cone, and leaves more.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    first : NeedleFit
+        A first look.
+    noise : NoiseModel
+
+    Returns
+    -------
+    NeedleFit
+        That leaves least.
+    """
     fits = [first]
     for taper in (t for t in TAPERS if t != first.shape.taper):
         shape = replace(fits[-1].shape, taper=taper)

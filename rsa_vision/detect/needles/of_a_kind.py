@@ -37,8 +37,8 @@ _MOST_IN_VAIN = 60  # places in a row at which there are none
 _ROUGHLY = 0.5  # of what a pin must have, for a closer look
 _ODD = 6.0  # half the chi2 by which chance makes a pin of the known size worse than a rod, or a pin, of free size
 _PALE = 0.5  # of the typical depth
-# logarithms of half width and length: how far first looks of one kind differ, what is like the clear ones, and these among themselves (rms)
-_ROUGHLY_ALIKE, _ALIKE, _OF_A_KIND = 0.35, 0.12, 0.1
+# logarithms of half width and length: how far first looks of one kind differ, and pins of one; part of a film's pins that are of one
+_ROUGHLY_ALIKE, _ALIKE, _MOST = 0.35, 0.12, 0.6
 _TELL, _SAME_LENGTH = 6, 0.05  # pins of a film that tell what is odd; logarithm of the lengths of one kind
 
 
@@ -58,10 +58,10 @@ def others_like(film: NDArray[Any], known: list[NeedleFit], places: Float, optic
     Returns
     -------
     list of NeedleFit
-        None of the known ones; none at all if they would be more than these, which are not of one kind.
+        None of the known ones; none at all if these are not of a kind.
     """
     clear = [f for f in known if is_pin(f, noise)]
-    if len(clear) < LEAST_OF_A_KIND:
+    if not are_of_a_kind(clear):
         return []
     width, length = np.exp(np.median(_log_sizes(clear), axis=0)).tolist()
     typical = replace(
@@ -82,7 +82,7 @@ def others_like(film: NDArray[Any], known: list[NeedleFit], places: Float, optic
         if found and _is_like(film, found, typical, optics, noise) and not any(same_body(found, k) for k in (*known, *out)):
             out.append(found)
             in_vain = 0
-    return out if are_of_a_kind(clear) or len(out) <= len(known) else []
+    return out
 
 
 def _fit_like(film: NDArray[Any], typical: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit | None:
@@ -115,15 +115,17 @@ def _is_like(film: NDArray[Any], fit: NeedleFit, typical: NeedleFit, optics: Opt
 
 def are_alike(pins: list[NeedleFit]) -> bool:
     """Say whether more first looks than make a kind are of about one size, so that they are worth another."""
-    if not pins:
-        return False
-    sizes = _log_sizes(pins)
-    return int((np.abs(sizes - np.median(sizes, axis=0)) < _ROUGHLY_ALIKE).all(axis=1).sum()) > LEAST_OF_A_KIND
+    return bool(pins) and _count_alike(pins, _ROUGHLY_ALIKE) > LEAST_OF_A_KIND
 
 
 def are_of_a_kind(pins: list[NeedleFit]) -> bool:
-    """Say whether several pins are nearly as large as each other: trabeculae are of any size."""
-    return len(pins) >= LEAST_OF_A_KIND and bool((_log_sizes(pins).std(axis=0) < _OF_A_KIND).all())
+    """Say whether several pins, and most, are nearly as large as each other: trabeculae are of any size."""
+    return bool(pins) and _count_alike(pins, _ALIKE) >= max(LEAST_OF_A_KIND, _MOST * len(pins))
+
+
+def _count_alike(pins: list[NeedleFit], within: float) -> int:
+    sizes = _log_sizes(pins)
+    return int((np.abs(sizes - np.median(sizes, axis=0)) < within).all(axis=1).sum())
 
 
 def odd_lengths(pins: list[NeedleFit]) -> list[float]:

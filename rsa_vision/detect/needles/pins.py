@@ -14,7 +14,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
-from rsa_vision.detect.needles.first_pins import distinct, likest_pins
+from rsa_vision.detect.needles.first_pins import best_tapered, distinct, likest_pins
 from rsa_vision.detect.needles.fits import excess_of, fit_needles, significant_misfit
 from rsa_vision.detect.needles.of_a_kind import are_alike, are_of_a_kind, odd_lengths, others_like
 from rsa_vision.detect.needles.optics import common_optics
@@ -81,11 +81,11 @@ def find_pins(
     found = _found_from(film, rough, places, tees, [optics], noise)
     if tees or are_of_a_kind(found[0]):
         return found
-    likest = likest_pins(film, long_places, sign, noise)
-    if not are_alike([f for f in likest if is_pin(f, noise)]):
+    rough = [best_tapered(film, f, noise) for f in rough] + likest_pins(film, long_places, sign, noise)
+    if not are_alike([f for f in distinct(rough) if is_pin(f, noise)]):
         return found
     trials = [optics, *(replace(optics, sigma_px=sigma) for sigma in _OTHER_BLURS_PX)]
-    more = _found_from(film, rough + likest, places, tees, trials, noise)
+    more = _found_from(film, rough, places, tees, trials, noise)
     return more if are_of_a_kind(more[0]) else found
 
 
@@ -108,7 +108,9 @@ def _found_from(
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
     fits = [[_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes] for f, shapes in zip(rough, starts, strict=True)]
-    pins = [min([*ways, *(_refit_turned(film, f, optics, noise) for f in ways)], key=unexplained) for ways in fits]
+    if len(trials) > 1:  # optics were guessed at first: whichever way round a pin began says little
+        fits = [[*ways, *(_refit_turned(film, f, optics, noise) for f in ways)] for ways in fits]
+    pins = [min(ways, key=unexplained) for ways in fits]
     pins = pointed(film, distinct(_still(pins, noise)), optics, noise)
     pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
     # what pins have told of the film curve does not count twice: only their blur is where they begin
