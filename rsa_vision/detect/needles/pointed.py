@@ -22,7 +22,7 @@ EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters le
 SIGNIFICANT, _CHANCE = 9.0, 2.0  # and standard deviations of what noise leaves under a pin
 SURER_THAN_ROD = 12.0  # half the chi2 by which a rod must be worse
 _ALONE = 5.0  # standard deviations of one pixel: lower ones, of which there are fewer, may be anything as long
-_RATHER_THAN_ROD, RATHER_THAN_TURNED = 2.5, 7.0
+_RATHER_THAN_ROD, RATHER_THAN_TURNED, _ONE_WAY = 2.5, 7.0, 2.5  # the last for what has been told from a rod already
 _OF_LEFT = 0.5  # of the chi2 that a fit leaves beyond noise, by which the same the other way round must be worse
 _ROD = 0.02  # taper of a rod: blunt
 LEAST_OF_A_KIND = 3  # clear pins from which a film is one of pins: others then need less
@@ -111,7 +111,7 @@ def points_one_way(film: NDArray[Any], fit: NeedleFit, others: Images | None, op
     tip, angles = turned(fit)
     both = [fit, replace(fit, position_px=tip, angles=angles)]
     left, more = (fit_crossing(film, [f], optics, noise, others=others, edge=fit.edged)[0].chi2_core for f in both)
-    return bool(more - left > 2 * RATHER_THAN_TURNED * max(left, 1.0) / fit.n_core + _OF_LEFT * max(left - 1.0, 0.0))
+    return bool(more - left > 2 * _ONE_WAY * max(left, 1.0) / fit.n_core + _OF_LEFT * max(left - 1.0, 0.0))
 
 
 def turned(fit: NeedleFit) -> tuple[Float, Float]:
