@@ -192,7 +192,7 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
         if among.sum() < LEAST_IMAGES:
             continue
         _weigh(namings, scene, seen, log_room, find_hypotheses(scene, seen.xy_mm[among], reading.turn_deg, missing, limits))
-        complete, moved_from = _is_complete(namings, scene, enough_for_all), None
+        complete, moved_from = _names_more_than(enough_for_all, namings, scene), None
         while namings and not complete and moved_from is not (best := max(namings, key=lambda n: n.log_evidence)):
             # once more from where it settled: what drew a focus aside at first, and kept its marks from their images, may do so no longer
             again = name_marks(scene, best.fit.parameters, seen, log_room)
@@ -201,7 +201,7 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
                 best = again
             _weigh(namings, scene, seen, log_room, moved_by_a_mark(scene, best.fit.parameters, limits))
             moved_from = best  # what is better than that may look like itself, moved, as well
-        enough = any((naming.image[scene.own] >= 0).mean() > HALF for naming in namings)
+        enough = _names_more_than(HALF, namings, scene)
         if enough or not misread or among.all():
             result = _decide(answer, scene, namings, seen, limits, log_room)
         sure = enough and result and "cage-ambiguous" not in result.reasons  # what the other images hide of it was weighed, too
@@ -210,8 +210,9 @@ def _read(film: _Film, reading: _Reading, likely: Int, misread: bool, limits: Li
     return result
 
 
-def _is_complete(namings: list[Naming], scene: Scene, enough: float) -> bool:
-    return any((naming.image[scene.own] >= 0).mean() > enough for naming in namings)
+def _names_more_than(part: float, namings: list[Naming], scene: Scene) -> bool:
+    """Say whether any of these names more than a part of the marks."""
+    return any((naming.image[scene.own] >= 0).mean() > part for naming in namings)
 
 
 def _weigh(namings: list[Naming], scene: Scene, seen: FilmImages, log_room: float, starts: list[Float]) -> None:

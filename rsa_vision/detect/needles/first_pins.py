@@ -21,7 +21,7 @@ from rsa_vision.types import Float
 
 MOST_STROKES = 120  # strongest of a film, most of them seen by two filters
 _GUESS = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
-ROUGH = 0.85  # explained by a first look, with guessed optics
+_ROUGH = 0.85  # explained by a first look, with guessed optics
 _MOST_IN_VAIN = 20  # strokes in a row that are no pins
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
 _CLOSE_FIT = 0.03  # misfit and what is not explained, of a pin whose taper is right
@@ -61,7 +61,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
             tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
             fits.append(fit_needles(film, tip, np.array([turn]), start, _GUESS, noise, quick=True))
         best = max(fits, key=lambda f: f.explained)
-        if explains(best, ROUGH, STANDS_OUT_ROUGHLY):
+        if explains(best, _ROUGH, STANDS_OUT_ROUGHLY):
             found.append(best)
             in_vain = 0
         if in_vain == _MOST_IN_VAIN:
@@ -97,7 +97,7 @@ def likest_pins(film: NDArray[Any], places: Float, sign: int, noise: NoiseModel)
         ways = (start.pin.position_px, start.pin.angles), turned(start.pin)
         fits = [fit_needles(film, *way, start.pin.shape, _GUESS, noise, quick=True) for way in ways]
         best = max(fits, key=lambda f: f.explained)
-        if explains(best, ROUGH, STANDS_OUT_ROUGHLY) and best.depth * sign > 0:
+        if explains(best, _ROUGH, STANDS_OUT_ROUGHLY) and best.depth * sign > 0:
             out.append(best_tapered(film, best, noise))
     return distinct(out)
 

@@ -28,7 +28,7 @@ _ROD = 0.02  # taper of a rod: blunt
 LEAST_OF_A_KIND = 3  # clear pins from which a film is one of pins: others then need less
 STANDS_OUT_ROUGHLY = 11.0  # significance from which noise may hide the form of a first look, and of one of a kind
 _SAMPLE = 6
-_OF_A_KIND = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
+_AS_LONG = 2.0  # ratio of length to the typical one: the pins of a film are of few sizes
 
 
 def is_slim(fit: NeedleFit) -> bool:
@@ -68,7 +68,7 @@ def pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: No
     alone = [by > SURER_THAN_ROD and is_pin(f, noise) for f, by in zip(pins, surer, strict=True)]
     clear = [f for f, enough in zip(pins, alone, strict=True) if enough]
     typical = float(np.median([f.shape.length_px for f in clear[:_SAMPLE]])) if clear else np.nan
-    clear = [f for f in clear if _of_a_kind(f, typical)]
+    clear = [f for f in clear if _about_as_long(f, typical)]
     if len(clear) < LEAST_OF_A_KIND:
         return standing_out(clear, noise)
     kept = list(clear)
@@ -76,14 +76,14 @@ def pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: No
         if not enough:
             ways = [fit, fit_needles(film, *turned(fit), fit.shape, optics, noise)]
             best, other = sorted(ways, key=unexplained)
-            rather = is_pin(best, noise, STANDS_OUT_ROUGHLY) and _of_a_kind(best, typical)
+            rather = is_pin(best, noise, STANDS_OUT_ROUGHLY) and _about_as_long(best, typical)
             rather = rather and worse_by(film, best, other, optics, noise) > RATHER_THAN_TURNED
             kept += [best] if rather and surer_than_rod(film, best, optics, noise) > _RATHER_THAN_ROD else []
     return kept
 
 
-def _of_a_kind(fit: NeedleFit, typical_px: float) -> bool:
-    return 1 / _OF_A_KIND < fit.shape.length_px / typical_px < _OF_A_KIND
+def _about_as_long(fit: NeedleFit, typical_px: float) -> bool:
+    return 1 / _AS_LONG < fit.shape.length_px / typical_px < _AS_LONG
 
 
 def standing_out(pins: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:

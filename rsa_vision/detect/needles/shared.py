@@ -135,7 +135,7 @@ def fit_shared(
             at, systems, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
             step, shorter, converged = step.shorter(), shorter + 1, False
         else:
-            told = [e.information() for e, tells in zip(systems, telling, strict=True) if tells]
+            told = [e.information() for e in compress(systems, telling)]
             normal = held + sum(matrix for matrix, _ in told)
             target = np.sum([right for _, right in told], axis=0)
             if count == steps or converged:
@@ -179,7 +179,7 @@ def fit_shared(
             at, converged, least = replace(at, sizes=sizes_of(systems, at.sets)), False, np.inf
     through = _quietest(film, windows, systems, noise)
     systems = [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
-    told = [e.information() for e, tells in zip(systems, telling, strict=True) if tells]
+    told = [e.information() for e in compress(systems, telling)]
     normal = precision + sum(matrix for matrix, _ in told)
     change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at.taper)
     step = Step(change, [e.step(change) for e in systems])
