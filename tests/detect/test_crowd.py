@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
+from rsa_vision.detect.balls.crowd import lost_in_a_crowd
+from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.detect.search.candidates import Candidates
 
 from .films import stored
 
@@ -32,3 +35,22 @@ def test_trabeculae_without_marks_are_none() -> None:
     print(f"{[len(images) for images in found]} found, {sum(np.count_nonzero(images.flags == 0) for images in found)} unflagged")
     assert sum(map(len, found)) <= 7
     assert sum(np.count_nonzero(images.shape == "pin") for images in found) <= 4
+
+
+def test_faint_marks_are_lost_among_texture_only() -> None:
+    """Of what the model explains less closely, those that are no stronger than a crowd beyond noise; in noise there is none."""
+    count, rng = 5, np.random.default_rng(0)
+    places = rng.uniform(2000, 3000, (400, 2))
+    balls = np.stack([np.full(count, 500.0), 100.0 * np.arange(count)], axis=1)
+    own, explained = np.array([20.0, 6.5, 6.5, 5.0, 5.0]), np.array([0.9, 0.9, 0.97, 0.9, 0.99])
+    none = np.zeros((count, 4, 4))
+    fits = BallFits(balls, np.full(count, 4.0), own, none, *[own] * 3, explained, *[own] * 6, own > 0)
+    for texture, lost in (
+        (rng.uniform(5.6, 9.0, 400), [1, 3]),
+        (rng.uniform(4.0, 5.4, 400), []),
+        (np.append(rng.uniform(4, 5.4, 381), [7.0] * 19), []),
+    ):
+        strength = np.concatenate([own, texture])
+        at = np.concatenate([balls, places])
+        candidates = Candidates(at, np.full(len(at), 4.4), strength, np.full(len(at), 0.8), np.zeros((0, 5)), np.zeros((0, 6)))
+        assert np.flatnonzero(lost_in_a_crowd(fits, candidates)).tolist() == lost

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from rsa_vision.detect.balls.decide import CLOSE
 from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.search.candidates import Candidates
-from rsa_vision.types import Bool
+from rsa_vision.types import Bool, Float
 
 _ROUND = 0.4  # roundness of what may look like a ball at a glance
 _AS_STRONG = 0.6  # of the filter's answer
 _MANY = 3  # times as many others as balls, all so strong
 _NEAR_PX = 2.0  # beyond the rim, what still is an answer to a ball
+_BY_NOISE = 5.5  # local spreads, to which noise alone makes the filter answer hardly anywhere on a film
+_PASSES = 1 / 20  # of what stands out of a texture, this part passes for balls
 
 
 def out_of_a_crowd(balls: BallFits, candidates: Candidates) -> Bool:
@@ -30,10 +33,35 @@ def out_of_a_crowd(balls: BallFits, candidates: Candidates) -> Bool:
     -------
     ndarray of bool, shape (n,)
     """
+    own, others = _answers(balls, candidates)
+    crowd, like = ((these >= _AS_STRONG * own[:, None]).sum(axis=1) for these in (others, own))
+    return np.asarray((crowd <= _MANY * like) | (own == 0.0))
+
+
+def lost_in_a_crowd(balls: BallFits, candidates: Candidates) -> Bool:
+    """Say which balls may be texture though others of the film are marks: so much of that is as strong that one is expected to look so.
+
+    What noise alone may make is no texture, and what a model explains closely is a ball.
+
+    Parameters
+    ----------
+    balls : BallFits
+    candidates : Candidates
+        As for :func:`out_of_a_crowd`.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    own, others = _answers(balls, candidates)
+    as_strong = (others >= np.maximum(own, _BY_NOISE)[:, None]).sum(axis=1)
+    return np.asarray((_PASSES * as_strong > 1) & (own > 0.0) & (balls.explained < CLOSE))
+
+
+def _answers(balls: BallFits, candidates: Candidates) -> tuple[Float, Float]:
+    """Strongest answers of the filter to balls (n,), and those to all that is round and none of them."""
     gap = np.hypot(*(candidates.position_px[:, None] - balls.position_px).transpose(2, 0, 1))
     at = gap < balls.radius_px + _NEAR_PX
     strength = np.abs(candidates.strength)
     own = np.where(at, strength[:, None], 0.0).max(axis=0, initial=0.0)
-    others = strength[~at.any(axis=1) & (candidates.roundness > _ROUND)]
-    crowd, like = ((these >= _AS_STRONG * own[:, None]).sum(axis=1) for these in (others, own))
-    return np.asarray((crowd <= _MANY * like) | (own == 0.0))
+    return own, strength[~at.any(axis=1) & (candidates.roundness > _ROUND)]

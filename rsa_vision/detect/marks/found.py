@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.crowd import out_of_a_crowd
+from rsa_vision.detect.balls.crowd import lost_in_a_crowd, out_of_a_crowd
 from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, are_balls, faint_beside, look_clear, show_what_marks_are_like
 from rsa_vision.detect.balls.find import MISFIT, ROUNDNESS, STRENGTH, fit_at, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
@@ -88,7 +88,7 @@ def marks_of(
     if around.under > _MUCH_MORE and seen.noise.blur_px > _SMOOTHED * seen.optics.sigma_px:
         rougher = replace(seen, noise=seen.noise.blurred_by(_USUAL_BLUR * seen.optics.sigma_px))
         return marks_of(film, bits, rougher, rough_pins, candidates, faint, limit, mottled=mottled)
-    return _measured(film, bits, found, needles, around, mine.junctions, seen.optics, seen.noise)
+    return _measured(film, bits, found, needles, around, faint, seen.optics, seen.noise)
 
 
 def _of_sign(candidates: Candidates, sign: int) -> Candidates:
@@ -188,9 +188,7 @@ def _find_balls(
     # the last fit does not know what was masked either
     found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], drawn=crossed[like])
     if len(found.fits.depth) and not show_what_marks_are_like(found.fits, limit, optics.sigma_px, noise):
-        away = np.array([np.hypot(*(faint.position_px - n.position_px).T) > _AT_NEEDLES * n.shape.length_px for n in others])
-        crowd = faint.rows(away.all(axis=0)) if others else faint
-        found = found.rows(look_clear(found.fits, noise) | out_of_a_crowd(found.fits, crowd))
+        found = found.rows(look_clear(found.fits, noise) | out_of_a_crowd(found.fits, _off_needles(faint, others)))
     tees = needles.tees
     for fit in needles.doubtful:
         if both := part(film, fit, found.fits, optics, needles.tee_optics, noise, needles.painted or _nothing, is_tee):
@@ -198,6 +196,12 @@ def _find_balls(
             found = found.rows(np.hypot(*(found.fits.position_px - ball.position_px[0]).T) > ball.radius_px[0])
             found, tees = found.and_more(ball, touching=True, edged=False, drawn=False), [*tees, tee]
     return found, tees
+
+
+def _off_needles(candidates: Candidates, needles: list[NeedleFit]) -> Candidates:
+    """Leave out what the search answers to a needle."""
+    away = [np.hypot(*(candidates.position_px - n.position_px).T) > _AT_NEEDLES * n.shape.length_px for n in needles]
+    return candidates.rows(np.all(away, axis=0)) if needles else candidates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,7 +225,7 @@ def _around(film: NDArray[Any], found: _Balls, needles: _Needles, optics: Optics
 
 
 def _measured(
-    film: NDArray[Any], bits: int, found: _Balls, needles: _Needles, around: _Around, junctions: Float, optics: Optics, noise: NoiseModel
+    film: NDArray[Any], bits: int, found: _Balls, needles: _Needles, around: _Around, faint: Candidates, optics: Optics, noise: NoiseModel
 ) -> tuple[MarkerImages, float]:
     """Where the marks are, with their errors and flags, and how much they speak for their polarity."""
     known, touching, painted, others = found.fits, found.touching, needles.painted, needles.all
@@ -247,7 +251,8 @@ def _measured(
     touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, by_size, touching, poor = balls.rows(keep), ratio[keep], by_size[keep], touching[keep], poor[keep]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
-    return table_of(film, bits, balls, under, ratio, by_size, touching, poor, others, junctions, optics, noise)
+    doubtful = lost_in_a_crowd(balls, _off_needles(faint, others))
+    return table_of(film, bits, balls, under, ratio, by_size, touching, poor, doubtful, others, faint.junctions, optics, noise)
 
 
 def _nothing(cols: Float, _: Float) -> Float:

@@ -54,6 +54,7 @@ def table_of(
     by_size: Float,
     touching: Bool,
     poor_ball: Bool,
+    doubtful: Bool,
     tees: list[NeedleFit],
     junctions: Float,
     optics: Optics,
@@ -72,8 +73,8 @@ def table_of(
         Squared errors by their surroundings, as :func:`rsa_vision.detect.marks.settle.settle` tells.
     by_size : ndarray of shape (n,)
         Variances of balls of a size of their own, px^2, as of the same: no noise multiplies them.
-    touching, poor_ball : ndarray of bool, shape (n,)
-        Balls with something as dense beside them; balls that the model does not describe.
+    touching, poor_ball, doubtful : ndarray of bool, shape (n,)
+        Balls with something as dense beside them; that the model does not describe; that may belong to the texture of the film.
     tees : list of NeedleFit
         And pins.
     junctions : ndarray of shape (k, 5)
@@ -133,8 +134,10 @@ def table_of(
     flags[n:][np.linalg.eigvalsh(covariance[n:])[:, -1] > (2 * radius[n:]) ** 2] |= MarkerFlag.POOR_FIT
     pale = too_pale(depth[:n], balls.covariance[:, 3, 3], balls.background, flags[:n] == 0)
     marks = np.flatnonzero(~pale)  # what is none is no company for another's odd size
-    odd = marks[of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])]
-    flags[np.append(np.flatnonzero(pale), odd)] |= MarkerFlag.UNLIKE
+    unlike = pale.copy()
+    unlike[marks] = of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])
+    flags[:n][unlike | doubtful] |= MarkerFlag.UNLIKE
+    none = np.append(unlike & doubtful, np.zeros(m, bool))  # texture, by two signs
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
@@ -142,7 +145,8 @@ def table_of(
     # of what is small against the blur hardly any of its depth is seen
     high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
     trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
-    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
+    order = np.lexsort((position[:, 0], np.rint(position[:, 1])))
+    return table.rows(order[~none[order]]), float(trust @ np.minimum(high, CAP))
 
 
 def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
