@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
-from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.detect.models.profiles import TAIL, Optics
 from rsa_vision.types import Bool, Float, Int
@@ -30,6 +30,7 @@ _LOG_GRID = math.log(GRID)
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
 _BLUR_GRID = 0.002  # of the logarithm of a needle's own blur
 _UNEVEN_GRID = 0.02  # between what is uneven, of the blur of an arm, that has tables of its own
+_KERNEL, _UNBLURRED = 4.5, np.ones(1)  # standard deviations to which a kernel goes; one of none
 _PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
 
@@ -140,23 +141,30 @@ def _opacity(
     mirrored = not (skew or oblique)  # one half is enough
     p = cell_p * np.arange(n_p // 2 + 1) if mirrored else first[1] * wider + cell_p * np.arange(n_p)
     half_width, length = half_width * wider, length * longer
-    fine_s = (s[:, None] + cell_s * (np.arange(2) - 0.5) / 2).reshape(-1, 1)
-    fine_p = (p[:, None] + cell_p * (np.arange(2) - 0.5) / 2).ravel()
-    width = half_width * np.clip(fine_s / (taper * length), 0.0, 1.0)
+    # where the needle is, with what rays that cross its end aslant see of it; only blur comes to the other nodes
+    far = length + (math.sqrt(slant) + abs(skew)) * half_width
+    rows, cols = (
+        slice(*np.searchsorted(at, (low - step, high + step)))
+        for at, step, low, high in ((s, cell_s, 0, far), (p, cell_p, -half_width, half_width))
+    )
+    fine_s, fine_p = ((at[:, None] + step * (np.arange(2) - 0.5) / 2).ravel() for at, step in ((s[rows], cell_s), (p[cols], cell_p)))
+    width = half_width * np.clip(fine_s[:, None] / (taper * length), 0.0, 1.0)
     chord = 2 * np.sqrt(np.maximum(width**2 - fine_p**2, 0.0))
-    before = length - fine_s - skew * fine_p
+    before = length - fine_s[:, None] - skew * fine_p
     if slant:
         chord *= np.clip(0.5 + before / (np.sqrt(slant) * np.maximum(chord, 1e-9)), 0.0, 1.0)
-    opacity = -np.expm1(-optics.mu_px * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
-    opacity = opacity.reshape(len(s), 2, len(p), 2).mean((1, 3))
+    fine = -np.expm1(-optics.mu_px * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
+    opacity = np.zeros((n_s, len(p)))
+    opacity[rows, cols] = (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2]) / 4
 
     def blurred(sigma: float) -> Float:
         parts = (1 + along, cell_s), (1 - along, cell_p)
         var_s, var_p = (max(part * sigma**2 / cell**2 - _OF_TABLE, 0.1) for part, cell in parts)
         if oblique:
             return _obliquely_blurred(opacity, var_s, var_p, oblique * sigma**2 / (cell_s * cell_p))
-        lengthwise = gaussian_filter1d(opacity, np.sqrt(var_s), axis=0, mode="constant", truncate=4.5)
-        return np.asarray(gaussian_filter1d(lengthwise, np.sqrt(var_p), axis=1, mode="mirror" if mirrored else "constant", truncate=4.5))
+        lengthwise = cv2.sepFilter2D(opacity, -1, _UNBLURRED, _kernel(var_s), borderType=cv2.BORDER_CONSTANT)
+        border = cv2.BORDER_REFLECT_101 if mirrored else cv2.BORDER_CONSTANT
+        return np.asarray(cv2.sepFilter2D(lengthwise, -1, _kernel(var_p), _UNBLURRED, borderType=border), np.float64)
 
     seen = blurred(blurrier * optics.sigma_px)
     if optics.tail:
@@ -164,6 +172,11 @@ def _opacity(
     if any(optics.curve):
         seen = film_curve(seen, optics.curve)[0]
     return np.concatenate([seen[:, :0:-1], seen], axis=1) if mirrored else seen
+
+
+def _kernel(variance: float) -> Float:
+    sigma = math.sqrt(variance)
+    return np.asarray(cv2.getGaussianKernel(2 * int(_KERNEL * sigma + 0.5) + 1, sigma), np.float64)
 
 
 def _obliquely_blurred(image: Float, var_s: float, var_p: float, covariance: float) -> Float:
