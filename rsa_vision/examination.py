@@ -27,6 +27,7 @@ from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
 from rsa_vision.verdict import STRETCH_LIMIT, Finding, Verdict, conclude, film_stretch, judge, local_scale
 from rsa_vision.xray import rays_of, reconstruct, reconstruct_calibrated, solve_focus
 
+SAME_PITCH: Final = 1e-4  # relative: what tags round differently; over a film of 4000 pixels less than half of one
 TIP_ERROR: Final = 0.01
 """Part of the half width: what the fits of all points of a cage have in common where the points are no cones (rounded, or cylinders with
 a short point). Root mean square over 33 films of another renderer; at the worst 3 %."""
@@ -163,6 +164,8 @@ def reconstruct_points(points: ImagePoints, study: Study, cage: Cage) -> Examina
 
 
 def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> ExaminationResult:
+    if differing := _unlike_cage_films(table.films[:n_cage_films], table.films[n_cage_films:]):
+        return _failed(table, differing)
     cage = cage.at_temperature(study.temperature_c)
     marks = [_identify(film, study, cage) for film in table.films[: n_cage_films or None]]
     findings = [(code, f"{film.path.name}: {_explain(code, m)}") for film, m in zip(table.films, marks, strict=False) for code in m.reasons]
@@ -252,6 +255,17 @@ def _read(film: Film, focus: int | None, pitch_mm: tuple[float, float] | None, s
     limit = study.limits.false_detections_per_film
     found = detect_markers(film.values, bits=film.bits, response=study.response, false_detections=limit).images
     return FilmReading(film.path, focus, (rows, cols), film.bits, pitch_mm, film.pitch_source, study.response, found)
+
+
+def _unlike_cage_films(cage_films: Sequence[FilmReading], films: Sequence[FilmReading]) -> list[Finding]:
+    """Find the films whose pixels are not those of the film of the cage: coordinates of one are then none of the other."""
+    findings: list[Finding] = []
+    for apart, film in zip(cage_films, films, strict=False):  # one for each, of the same focus
+        assert apart.pitch_mm is not None and film.pitch_mm is not None  # as in _identify
+        if apart.shape != film.shape or not np.allclose(apart.pitch_mm, film.pitch_mm, rtol=SAME_PITCH, atol=0):
+            said = [f"{f.path.name} has {f.shape[1]} x {f.shape[0]} pixels of {f.pitch_mm[1]:.5g} mm" for f in (apart, film) if f.pitch_mm]
+            findings.append(("cage-film-differs", ", ".join(said)))
+    return findings
 
 
 def _nominal(study: Study, cage: Cage) -> dict[int, tuple[float, float, float]]:

@@ -20,7 +20,7 @@ COMMON_SIGMA: Final = 3.0  # RMS of all crossing errors over their sd; they shar
 STRETCH_LIMIT: Final = 0.035  # scanners differ by 1 % between rows and columns; the builds of cage 1B by 5 %
 FAILURES: Final = frozenset(
     {"film-unreadable", "film-format", "film-name", "film-missing", "film-unexpected", "pitch-missing", "no-markers", "cage-not-found"}
-    | {"geometry", "calibration-invalid", "internal", "timeout"}
+    | {"geometry", "calibration-invalid", "cage-film-differs", "internal", "timeout"}
 )
 """Reasons that leave no coordinates."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,16 @@ import pytest
 from scipy.spatial import cKDTree
 
 import rsa_vision
+from rsa_vision.cages import load_cage
 from rsa_vision.cli import run_app
+from rsa_vision.examination import name_and_reconstruct
 from rsa_vision.flags import REASONS
+from rsa_vision.images import read_film
+from rsa_vision.readings import FilmReading
+from rsa_vision.settings import Study
+from rsa_vision.types import MarkerImages
 from synthetic.study import RenderedExamination
+from synthetic.write import write_film
 
 FIRST, SECOND = "S01_202601010900", "S01_202602010900"
 TEXT = {"exam": pl.String, "number": pl.String, "marker": pl.String, "flags": pl.String, "reasons": pl.String}
@@ -173,6 +181,35 @@ def test_the_cage_exposed_apart(folder: Path, tmp_path: Path, other_film: Callab
     roles = {(role, "_cage" in file) for role, file in images.select("role", "file").iter_rows()}
     assert {("fiducial", True), ("control", True), ("object", False)} <= roles
     assert not roles & {("fiducial", False), ("control", False), ("object", True)}
+
+
+@pytest.mark.parametrize("larger", [1.0, 1.05])
+def test_a_cage_film_of_another_pixel_pitch_is_refused(folder: Path, tmp_path: Path, larger: float) -> None:
+    """Its marks were taken for places on the other film: every marker was wrong by millimetres in an examination that was `ok`."""
+    for k in (1, 2):
+        film = read_film(folder / f"{FIRST}_f{k}.tif")
+        assert film.pitch_mm is not None
+        pitch = (larger * film.pitch_mm[0], larger * film.pitch_mm[1])
+        write_film(folder / f"{FIRST}_f{k}_cage.tif", film.values, bits=film.bits, pitch_mm=pitch)
+    out = tmp_path / "out"
+    run_app(["measure", str(folder), "-o", str(out)])
+    refused = statuses(out)[FIRST] == ("failed", "cage-film-differs")
+    assert refused == (larger != 1.0)
+    assert statuses(out)[SECOND] == ("ok", "")
+
+
+@pytest.mark.parametrize("rows", [1000, 997])
+def test_so_is_one_that_was_cut(rows: int) -> None:
+    images = MarkerImages.empty().rows(np.zeros(0, np.intp))
+    one = replace(
+        images, **{f.name: np.zeros((1, *getattr(images, f.name).shape[1:]), getattr(images, f.name).dtype) for f in fields(images)}
+    )
+    films = [
+        FilmReading(Path(name), 1, (n, 900), 16, (0.1, 0.1), "file", "auto", one) for name, n in (("a_cage.tif", rows), ("a.tif", 1000))
+    ]
+    verdict = name_and_reconstruct(films, Study(cage="2"), load_cage("2"), n_cage_films=1).verdict
+    assert (verdict.reasons == ("cage-film-differs",)) == (rows != 1000)
+    assert verdict.status == "failed"  # one mark is no cage
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,8 @@
 """Single pointed pins: found at their tips with honest errors, whichever film; rods are none."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -7,7 +10,9 @@ from scipy.ndimage import gaussian_filter
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.pointed import is_pin
+from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin
@@ -63,6 +68,21 @@ def film_of_pins(
         counts = 1 / (1 + (DENSE / (counts + 0.5 * base)) ** 2)
     values = 60000 - 50000 * counts if bright else 50000 * counts
     return np.clip(np.rint(values), 0, 65535).astype(np.uint16), np.array(tips), np.array(ways)
+
+
+def test_a_fit_that_ends_up_with_the_other_sign_is_no_pin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may among others; errors along pins go with the logarithm of their depths."""
+
+    def turned_over(*args: Any, **options: Any) -> tuple[list[NeedleFit], Optics]:
+        fits, optics = fit_shared(*args, **options)
+        first, *others = sorted(fits, key=lambda f: f.position_px[0])
+        return [replace(first, depth=-first.depth, depths=-first.depths), *others], optics
+
+    monkeypatch.setattr("rsa_vision.detect.needles.pins.fit_shared", turned_over)
+    film, tips, _ = film_of_pins(np.random.default_rng(2))
+    found = detect_markers(film, bits=16).images
+    gap = np.hypot(*(tips[:, None] - found.position_px).transpose(2, 0, 1)).min(axis=1)
+    assert np.flatnonzero(gap > 1.0).tolist() == [int(tips[:, 0].argmin())]
 
 
 def test_chance_is_not_blamed_on_a_pin() -> None:

@@ -19,6 +19,7 @@ from rsa_vision.detect.marks.settle import STRUCTURE
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import excess_of, significant_misfit
+from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
@@ -118,6 +119,8 @@ def table_of(
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
     flags[n:][perhaps_arms(tees, junctions)] |= MarkerFlag.UNLIKE
+    if np.count_nonzero(arms == 1) < LEAST_OF_A_KIND and n >= COMPANY:  # among balls a pin or two are more likely ends of rods
+        flags[np.flatnonzero(arms == 1) + n] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
     unknown = ~np.isfinite(covariance).all(axis=(1, 2))
     poor |= unknown

@@ -78,19 +78,19 @@ def find_pins(
     optics : Optics
         With the attenuation that suits the pins; where they are of a kind, with their blur, which beads between bones may not share.
     """
-    found = _found_from(film, rough, places, tees, [optics], noise)
+    found = _found_from(film, rough, places, tees, sign, [optics], noise)
     if tees or are_of_a_kind(found[0]):
         return found
     rough = [best_tapered(film, f, noise) for f in rough] + likest_pins(film, long_places, sign, noise)
     if not are_alike([f for f in distinct(rough) if is_pin(f, noise)]):
         return found
     trials = [optics, *(replace(optics, sigma_px=sigma) for sigma in _OTHER_BLURS_PX)]
-    more = _found_from(film, rough, places, tees, trials, noise)
+    more = _found_from(film, rough, places, tees, sign, trials, noise)
     return more if are_of_a_kind(more[0]) else found
 
 
 def _found_from(
-    film: NDArray[Any], rough: list[NeedleFit], places: Float, tees: list[NeedleFit], trials: list[Optics], noise: NoiseModel
+    film: NDArray[Any], rough: list[NeedleFit], places: Float, tees: list[NeedleFit], sign: int, trials: list[Optics], noise: NoiseModel
 ) -> tuple[list[NeedleFit], Optics]:
     """Find pins from first looks; ``trials``: what the film is known to be like, and what else it may be."""
     known = trials[0]
@@ -123,8 +123,8 @@ def _found_from(
         pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
         pins = pins if len(pins) >= LEAST_OF_A_KIND else standing_out(pins, noise)
     pins = [f for f in pins if points_one_way(film, f, others_beside(f, [o for o in pins if o is not f], optics), optics, noise)]
+    pins = [f for f in _still(pins, noise) if np.sign(f.depth) == sign]  # a fit among others may end up as the gap between them
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0
-    pins = _still(pins, noise)
     return [_less_sure_along(f, typical, odd, optics, noise) for f, odd in zip(pins, odd_lengths(pins), strict=True)], optics
 
 
