@@ -197,7 +197,8 @@ def _fit_group(
     spreads = [line_spread(some) for some in (source, target)]
     known = (np.isfinite(source_mm2) & np.isfinite(target_mm2)).all(axis=(1, 2, 3))
     one = np.sqrt(np.trace(source_mm2 + target_mm2, axis1=2, axis2=3).max(axis=1) / 6)
-    one = np.where(known, one, e_rb)
+    # of markers that are mirrored the fit itself tells no errors
+    one = np.where(known, one, np.sqrt(np.maximum(squares - rigid.mirror_gain_mm2, 0.0) / size))
     in_line = np.zeros(len(rows), bool)
     for along, about in spreads:
         in_line |= ~(about > np.maximum(COLLINEAR * along, IN_LINE_SIGMA * one))

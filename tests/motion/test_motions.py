@@ -179,6 +179,18 @@ def test_bad_input_is_a_row_with_its_reason_and_the_others_are_computed(damage, 
     assert np.isfinite([found[name][other] for name in ("tx_mm", "sd_tx_mm", "rx_deg", "sd_rx_deg", "mtpm_mm")]).all()
 
 
+def test_a_mirror_image_is_told_without_covariances_too() -> None:
+    """The residuals of the fit, which stand in for errors, were those of the wrong hand: the markers were said to lie in line."""
+    markers, at = two_segments()
+    bare = changed(markers, np.arange(len(markers)), covariance_mm2=np.nan)
+    stem = np.flatnonzero(markers.segment == "stem")
+    bare = changed(bare, stem, position_mm=np.tile([[-11, -8, -5], [6, 16, -2], [20, -10, 5], [14, 1, -11.0]], (2, 1)))
+    found = analyse(changed(bare, at, position_mm=bare.position_mm[at] * [-1, 1, 1]), limits=Limits())
+    row = pick(found, segment="stem", reference="")
+    assert found["status"][row] == "failed"
+    assert {"mirrored", "markers-in-line"} & set(found["reasons"][row].split(";")) == {"mirrored"}
+
+
 def test_a_marker_that_stands_twice_is_left_out_and_said() -> None:
     markers, at = two_segments(5)
     double = changed(markers, at[:1], marker="2")
