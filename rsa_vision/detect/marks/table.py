@@ -137,10 +137,8 @@ def table_of(
     flags[n:][np.linalg.eigvalsh(covariance[n:])[:, -1] > (2 * radius[n:]) ** 2] |= MarkerFlag.POOR_FIT
     pale = too_pale(depth[:n], balls.covariance[:, 3, 3], balls.background, flags[:n] == 0)
     marks = np.flatnonzero(~pale)  # what is none is no company for another's odd size
-    unlike = pale.copy()
-    unlike[marks] = of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])
-    flags[:n][unlike | doubtful] |= MarkerFlag.UNLIKE
-    none = np.append(unlike & doubtful, np.zeros(m, bool))  # texture, by two signs
+    odd = marks[of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])]
+    flags[np.append(np.flatnonzero(pale | doubtful), odd)] |= MarkerFlag.UNLIKE
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
@@ -148,8 +146,7 @@ def table_of(
     # of what is small against the blur hardly any of its depth is seen
     high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
     trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
-    order = np.lexsort((position[:, 0], np.rint(position[:, 1])))
-    return table.rows(order[~none[order]]), float(trust @ np.minimum(high, CAP))
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
 
 
 def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
