@@ -260,10 +260,11 @@ def _read(film: Film, focus: int | None, pitch_mm: tuple[float, float] | None, s
 def _unlike_cage_films(cage_films: Sequence[FilmReading], films: Sequence[FilmReading]) -> list[Finding]:
     """Find the films whose pixels are not those of the film of the cage: coordinates of one are then none of the other."""
     findings: list[Finding] = []
-    for apart, film in zip(cage_films, films, strict=False):  # one for each, of the same focus
-        assert apart.pitch_mm is not None and film.pitch_mm is not None  # as in _identify
-        if apart.shape != film.shape or not np.allclose(apart.pitch_mm, film.pitch_mm, rtol=SAME_PITCH, atol=0):
-            said = [f"{f.path.name} has {f.shape[1]} x {f.shape[0]} pixels of {f.pitch_mm[1]:.5g} mm" for f in (apart, film) if f.pitch_mm]
+    for pair in zip(cage_films, films, strict=False):  # one for each, of the same focus
+        pitches = [np.array(film.pitch_mm) for film in pair]  # a cage needs the pitch: required before
+        if pair[0].shape != pair[1].shape or not np.allclose(*pitches, rtol=SAME_PITCH, atol=0):
+            each = zip(pair, pitches, strict=True)
+            said = [f"{f.path.name} has {f.shape[1]} x {f.shape[0]} pixels of {p[1]:.5g} x {p[0]:.5g} mm" for f, p in each]
             findings.append(("cage-film-differs", ", ".join(said)))
     return findings
 

@@ -79,7 +79,7 @@ def test_nor_has_a_chest_that_was_treated_as_viewers_do(kind: str) -> None:
 
 
 def test_faint_balls_do_not_make_marks_of_what_a_chest_is_full_of() -> None:
-    """What passed for a ball like those few was any vessel of about their size: eight to fourteen, and no flag on them."""
+    """What passed for a ball like those few was any vessel of about their size: six to fourteen, and no flag on them."""
     film = read_film(REAL / "negatives/RG1_UNCR.dcm")
     height, width = film.values.shape
     rng = np.random.default_rng(1)
