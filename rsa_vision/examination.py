@@ -262,7 +262,7 @@ def _unlike_cage_films(cage_films: Sequence[FilmReading], films: Sequence[FilmRe
     findings: list[Finding] = []
     for pair in zip(cage_films, films, strict=False):  # one for each, of the same focus
         pitches = [np.array(film.pitch_mm) for film in pair]  # a cage needs the pitch: required before
-        if pair[0].shape != pair[1].shape or not np.allclose(*pitches, rtol=SAME_PITCH, atol=0):
+        if pair[0].shape != pair[1].shape or not np.allclose(pitches[0], pitches[1], rtol=SAME_PITCH, atol=0):
             each = zip(pair, pitches, strict=True)
             said = [f"{f.path.name} has {f.shape[1]} x {f.shape[0]} pixels of {p[1]:.5g} x {p[0]:.5g} mm" for f, p in each]
             findings.append(("cage-film-differs", ", ".join(said)))

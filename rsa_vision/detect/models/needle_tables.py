@@ -1,0 +1,182 @@
+"""Tables of the opacity of pointed pins and of its derivatives, on a grid of shapes that the needles of a film share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft2, rfft2
+
+from rsa_vision.detect.models.profiles import TAIL, Optics
+from rsa_vision.types import Float
+
+Key = tuple[float, float, float, Optics]  # of a table: half width, length, taper
+CELL, CELL_OF_BLUR = 0.3, 0.2  # pixels between the nodes of a needle table, and part of the blur where that is more
+GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
+SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
+LOG_GRID = math.log(GRID)
+_OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
+_KERNEL, _UNBLURRED = 4.5, np.ones(1)  # standard deviations to which a kernel goes; one of none
+_PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
+
+
+@lru_cache(maxsize=1024)
+def _opacity(
+    half_width: float,
+    length: float,
+    taper: float,
+    optics: Optics,
+    slant: float,
+    wider: float = 1.0,
+    longer: float = 1.0,
+    blurrier: float = 1.0,
+    skew: float = 0.0,
+) -> Float:
+    """Blurred opacity of a needle so many times wider and longer, on the grid for one of this half width and length stretched with it.
+
+    A ray in depth ``z`` of the needle crosses it at the distance ``s + sqrt(slant) z`` from the tip; of its chord only the part before the
+    flat end counts. The middle of the chord lies the further behind the further it is from the axis: ``skew`` times the distance.
+    What is uneven of the blur is that along the needle against across, and the covariance of both.
+    """
+    cell = cell_of(optics.sigma_px)
+    first, (n_s, n_p) = _grid(half_width, length, optics.sigma_px)
+    cell_s, cell_p = cell * longer, cell * wider
+    s = first[0] * longer + cell_s * np.arange(n_s)
+    along, oblique = optics.uneven
+    mirrored = not (skew or oblique)  # one half is enough
+    p = cell_p * np.arange(n_p // 2 + 1) if mirrored else first[1] * wider + cell_p * np.arange(n_p)
+    half_width, length = half_width * wider, length * longer
+    # where the needle is, with what rays that cross its end aslant see of it; only blur comes to the other nodes
+    far = length + (math.sqrt(slant) + abs(skew)) * half_width
+    rows, cols = (
+        slice(*np.searchsorted(at, (low - step, high + step)))
+        for at, step, low, high in ((s, cell_s, 0, far), (p, cell_p, -half_width, half_width))
+    )
+    fine_s, fine_p = ((at[:, None] + step * (np.arange(2) - 0.5) / 2).ravel() for at, step in ((s[rows], cell_s), (p[cols], cell_p)))
+    width = half_width * np.clip(fine_s[:, None] / (taper * length), 0.0, 1.0)
+    chord = 2 * np.sqrt(np.maximum(width**2 - fine_p**2, 0.0))
+    before = length - fine_s[:, None] - skew * fine_p
+    if slant:
+        chord *= np.clip(0.5 + before / (np.sqrt(slant) * np.maximum(chord, 1e-9)), 0.0, 1.0)
+    fine = -np.expm1(-optics.mu_px * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
+    opacity = np.zeros((n_s, len(p)))
+    opacity[rows, cols] = (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2]) / 4
+
+    def blurred(sigma: float) -> Float:
+        parts = (1 + along, cell_s), (1 - along, cell_p)
+        var_s, var_p = (max(part * sigma**2 / cell**2 - _OF_TABLE, 0.1) for part, cell in parts)
+        if oblique:
+            return _obliquely_blurred(opacity, var_s, var_p, oblique * sigma**2 / (cell_s * cell_p))
+        lengthwise = cv2.sepFilter2D(opacity, -1, _UNBLURRED, _kernel(var_s), borderType=cv2.BORDER_CONSTANT)
+        border = cv2.BORDER_REFLECT_101 if mirrored else cv2.BORDER_CONSTANT
+        return np.asarray(cv2.sepFilter2D(lengthwise, -1, _kernel(var_p), _UNBLURRED, borderType=border), np.float64)
+
+    seen = blurred(blurrier * optics.sigma_px)
+    if optics.tail:
+        seen += optics.tail * (blurred(TAIL * blurrier * optics.sigma_px) - seen)
+    if any(optics.curve):
+        seen = film_curve(seen, optics.curve)[0]
+    return np.concatenate([seen[:, :0:-1], seen], axis=1) if mirrored else seen
+
+
+def _kernel(variance: float) -> Float:
+    sigma = math.sqrt(variance)
+    return np.asarray(cv2.getGaussianKernel(2 * int(_KERNEL * sigma + 0.5) + 1, sigma), np.float64)
+
+
+def _obliquely_blurred(image: Float, var_s: float, var_p: float, covariance: float) -> Float:
+    """Blur by a Gaussian of this covariance matrix, in cells; what leaves one end comes in at the other, where the image has faded."""
+    at_s, at_p = 2 * np.pi * np.fft.fftfreq(image.shape[0])[:, None], 2 * np.pi * np.fft.rfftfreq(image.shape[1])
+    passed = np.exp(-0.5 * (var_s * at_s**2 + 2 * covariance * at_s * at_p + var_p * at_p**2))
+    return np.asarray(irfft2(rfft2(image) * passed, s=image.shape), np.float64)
+
+
+def film_curve(opacity: Float, curve: tuple[float, float]) -> Float:
+    """What film shows of blurred opacities, and its derivatives by the two coefficients of :attr:`Optics.curve`: on a new first axis."""
+    shifted = opacity / (opacity + math.exp(-curve[0]) * (1 - opacity))
+    bow = shifted * (1 - shifted)
+    skewed = bow * (1 - 2 * shifted)
+    return np.stack([shifted + curve[1] * skewed, bow * (1 + curve[1] * (1 - 6 * bow)), skewed])
+
+
+def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Return where the grid of a table begins along and across the needle, and how many nodes it has."""
+    pad, cell = _PAD * sigma, cell_of(sigma)
+    half = math.ceil((half_width + pad) / cell)
+    return (-pad, -half * cell), (math.ceil((length + 2 * pad) / cell) + 1, 2 * half + 1)
+
+
+def cell_of(sigma: float) -> float:
+    """Return the pixels between the nodes of a table for a blur of this standard deviation: nothing changes within a part of it."""
+    return max(CELL, CELL_OF_BLUR * sigma)
+
+
+@lru_cache(maxsize=1024)
+def table_for(
+    width_step: int, length_step: int, taper: float, optics: Optics
+) -> tuple[Key, tuple[float, float], tuple[float, float], tuple[float, float]]:
+    """Return the key of the table for about this size, where its grid begins and, in cells, its middle and how far it is seen."""
+    half_width, length, sigma = round(GRID**width_step, 4), round(GRID**length_step, 4), round(optics.sigma_px, 3)
+    first, (n_s, n_p) = _grid(half_width, length, sigma)
+    middle, rim = ((n_s - 1) / 2, (n_p - 1) / 2), (_PAD - _FADED) * sigma / cell_of(sigma)
+    curve = round(optics.curve[0], 3), round(optics.curve[1], 3)
+    near = Optics(sigma, round(optics.mu_px, 4), curve, round(optics.tail, 3))
+    return (half_width, length, round(taper, 3), near), first, middle, (middle[0] - rim, middle[1] - rim)
+
+
+@lru_cache(maxsize=256)
+def table(half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str) -> NDArray[np.float32]:
+    """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
+
+    ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur, by
+    the taper, by the curve, by the tail and by what is uneven, alone.
+    """
+    one = half_width, length, taper, optics, slant
+    base = _opacity(*one)
+    nodes = [
+        base,
+        (_opacity(*one, wider=GRID) - base) / ((GRID - 1) * half_width),
+        (_opacity(*one, longer=GRID) - base) / ((GRID - 1) * length),
+    ]
+    if more == "ends":
+        nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
+    nodes += np.gradient(base, cell_of(optics.sigma_px))
+    if more == "optics":
+        factor = float(np.exp(STEP))
+        dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
+        wide, short = _opacity(*one, blurrier=factor), _opacity(half_width, length, taper - STEP, optics, slant)
+        straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0)), slant)
+        spread = _opacity(half_width, length, taper, replace(optics, tail=optics.tail + STEP), slant)
+        _, *by_curve = film_curve(straight, optics.curve)
+        uneven = [
+            _opacity(half_width, length, taper, replace(optics, uneven=(optics.uneven[0] + along, optics.uneven[1] + oblique)), slant)
+            for along, oblique in ((STEP, 0.0), (0.0, STEP))
+        ]
+        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *by_curve]
+        nodes += [(more - base) / STEP for more in (spread, *uneven)]
+    values = np.array(nodes, np.float32)
+    values[:, [0, -1]] = values[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
+    return values
+
+
+def look_up(values: NDArray[np.float32], at_s: Float, at_p: Float) -> Float:
+    """Interpolate all columns of a table bilinearly at these places in units of its cells, within it; single precision is far finer."""
+    n_p = values.shape[2]
+    low_s, low_p = at_s.astype(np.intp), at_p.astype(np.intp)
+    part_s, part_p = (at_s - low_s).astype(np.float32), (at_p - low_p).astype(np.float32)
+    node = low_s * n_p + low_p
+    nodes = values.reshape(len(values), -1)
+    near: NDArray[np.float32] = nodes.take(node, axis=1, mode="wrap")
+    beside, far, across = (nodes.take(node + step, axis=1, mode="wrap") for step in (1, n_p, n_p + 1))  # within: spares the check
+    for low, high in ((near, beside), (far, across)):
+        high -= low
+        high *= part_p
+        low += high
+    far -= near
+    far *= part_s
+    near += far
+    return near.astype(np.float64)
