@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from scipy.special import expit
 
-from rsa_vision.identify.densities import log_kernels, log_student, weighted_median
+from rsa_vision.identify.densities import log_kernels, log_student, some_of, weighted_median
 from rsa_vision.identify.looks import CLASSES, KIND, WIDE, Looks
 from rsa_vision.types import Bool, Float, Int
 
@@ -62,27 +62,28 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     broad = (log_student((value - middle) / np.hypot(wide, unsure), 3.0) - np.log(np.hypot(wide, unsure))).sum(axis=1)
     shares = _shares(quality, paired[one])
     odds = np.log(CLASSES * shares)[quality]
-    odds[known] += [
-        log_kernels(value[k], value[clear], of_pairs[clear], np.hypot(kind, unsure[k]), 2 * pairs) for k in np.flatnonzero(known)
-    ]
+    odds[known] += log_kernels(value[known], value[clear], of_pairs[clear], np.hypot(kind, unsure[known]), 2 * pairs)
     odds[known] -= broad[known]
     hidden = _hidden(float(single @ expit(odds)), pairs)
     presumed = hidden * 2 * pairs
     of_image = np.zeros(len(one))
-    for k in np.flatnonzero(known):  # among those fitted as well as this one, or as badly
-        alike = known & ((quality == 0) == (quality[k] == 0))
-        others, unknown = np.arange(len(one)) != k, UNKNOWN * (1 if quality[k] == 0 else CLASSES - 1) / CLASSES
-        markers = presumed * float(shares[0] if quality[k] == 0 else 1 - shares[0])
-        weights, widths = (np.where(alike & others, single, 0.0), np.where(clear & others, of_pairs, 0.0)), np.hypot(kind, unsure[k])
-        parts = [np.log(unknown) + broad[k]]
-        if weights[0].sum() > 0:
-            n = float(weights[0].sum())
-            # unlike those of markers, their looks have no kind: how far they spread is not told by one or two
-            spread = np.hypot(np.hypot(widths, unsure[k]), wide / (2 * np.sqrt(n + 1)))
-            parts.append(np.log(n) + log_kernels(value[k], value[alike], weights[0][alike], spread, n))
-        if weights[1].sum() > 0:
-            parts.append(np.log(markers) + log_kernels(value[k], value[clear], weights[1][clear], widths, 2 * pairs))
-        of_image[k] = np.logaddexp.reduce(parts) - np.log(weights[0].sum() + markers + unknown)
+    images = np.flatnonzero(known)
+    for at in some_of(images, len(images)):  # among those fitted as well as this one, or as badly
+        well = quality[at] == 0
+        others = at[:, None] != images
+        weight = others * np.where(well[:, None] == (quality[images] == 0), single[images], 0.0)
+        of_markers = others * of_pairs[images]
+        unknown, markers = UNKNOWN * np.where(well, 1, CLASSES - 1) / CLASSES, presumed * np.where(well, shares[0], 1 - shares[0])
+        n, width = weight.sum(axis=1), np.hypot(kind, unsure[at])
+        # unlike those of markers, their looks have no kind: how far they spread is not told by one or two
+        spread = np.hypot(np.hypot(width, unsure[at]), wide / (2 * np.sqrt(n + 1))[:, None])
+        parts = np.full((3, len(at)), -np.inf)
+        parts[0] = np.log(unknown) + broad[at]
+        some = n > 0
+        parts[1, some] = np.log(n[some]) + log_kernels(value[at[some]], value[images], weight[some], spread[some], n[some])
+        some = of_markers.sum(axis=1) > 0
+        parts[2, some] = np.log(markers[some]) + log_kernels(value[at[some]], value[images], of_markers[some], width[some], 2 * pairs)
+        of_image[at] = np.logaddexp.reduce(parts, axis=0) - np.log(n + markers + unknown)
     density = of_image[np.searchsorted(looks.image[one], looks.image)]
     return Alone(density, _log_quality(looks, one, paired, presumed), hidden)
 
@@ -92,13 +93,13 @@ def _log_quality(looks: Looks, one: Int, paired: Float, presumed: float) -> Floa
 
     Among those without are presumed ones, as for the looks: hidden markers, and some of any class.
     """
-    result = np.zeros(len(looks.quality))
-    for ray, mine in enumerate(looks.quality):
-        others = one[looks.image[one] != looks.image[ray]]
-        with_partner, single = _shares(looks.quality[others], paired[others]), 1 - paired[others]
-        without = np.bincount(looks.quality[others], single, CLASSES) + presumed * with_partner + UNKNOWN / CLASSES
-        result[ray] = np.log(with_partner[mine] / (without[mine] / without.sum()))
-    return result
+    mine = np.eye(CLASSES)[looks.quality]
+    of_all, own = np.eye(CLASSES)[looks.quality[one]], paired[one][np.searchsorted(looks.image[one], looks.image), None]
+    with_partner = np.maximum(paired[one] @ of_all - own * mine, 0.0) + 1 / CLASSES
+    with_partner /= with_partner.sum(axis=1, keepdims=True)
+    without = np.maximum((1 - paired[one]) @ of_all - (1 - own) * mine, 0.0) + presumed * with_partner + UNKNOWN / CLASSES
+    without /= without.sum(axis=1, keepdims=True)
+    return np.asarray(np.log((with_partner * mine).sum(axis=1) / (without * mine).sum(axis=1)))
 
 
 def _shares(quality: Int, weight: Float) -> Float:

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from rsa_vision.identify.densities import log_kernels
+from rsa_vision.identify.densities import log_kernels, some_of
 from rsa_vision.identify.looks import FAINT, LEARNT_FROM
 from rsa_vision.types import Float, Int
 
@@ -62,11 +62,10 @@ def log_odds_of_depths(depth: Float, log_chance: Float, a: Int, b: Int, pair: Fl
     """
     result = np.zeros(len(depth))
     teachers = np.flatnonzero(pair > FAINT)
-    for e in range(len(depth)):
-        free = teachers[(a[teachers] != a[e]) & (b[teachers] != b[e])]
-        n = float(pair[free].sum())
-        if n >= LEARNT_FROM:
-            near = log_kernels(depth[e : e + 1], depth[free, None], pair[free], np.array([LEAST_SPREAD]), n, 1.0)
-            anywhere = np.log(ELSEWHERE / (n + ELSEWHERE)) + log_chance[e]
-            result[e] = np.logaddexp(np.log(n / (n + ELSEWHERE)) + near, anywhere) - log_chance[e]
+    weights = pair[teachers] * ((a[teachers] != a[:, None]) & (b[teachers] != b[:, None]))
+    for at in some_of(np.flatnonzero(weights.sum(axis=1) >= LEARNT_FROM), len(teachers)):
+        n = weights[at].sum(axis=1)
+        near = log_kernels(depth[at, None], np.tile(depth[teachers, None], (len(at), 1, 1)), weights[at], np.array([LEAST_SPREAD]), n, 1.0)
+        anywhere = np.log(ELSEWHERE / (n + ELSEWHERE)) + log_chance[at]
+        result[at] = np.logaddexp(np.log(n / (n + ELSEWHERE)) + near, anywhere) - log_chance[at]
     return result

@@ -53,11 +53,10 @@ def chance_of_marker(look: Float, place_px: Float, quality: Int, paired: Bool, s
     clear = teachers[quality[teachers] == 0]
     if len(clear):
         middle = np.median(look[clear], axis=0)
-        for k, row in enumerate(lone):
-            width = np.hypot(KIND, UNSURE if quality[row] else 0.0)
-            marker = log_kernels(look[row], look[clear], np.ones(len(clear)), width, len(clear))
-            anything = log_student((look[row] - middle) / WIDE, 3.0) - np.log(WIDE)
-            odds[k] += marker - float(anything.sum())
+        width = np.hypot(KIND, np.where((quality[lone] > 0)[:, None], UNSURE, 0.0))
+        marker = log_kernels(look[lone], look[clear], np.ones(len(clear)), width, len(clear))
+        anything = log_student((look[lone] - middle) / WIDE, 3.0) - np.log(WIDE)
+        odds += marker - anything.sum(axis=1)
     result[lone] = expit(odds)
     return result
 

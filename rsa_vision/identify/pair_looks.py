@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from rsa_vision.identify.alone import Alone
-from rsa_vision.identify.densities import log_kernels, log_student, weighted_median
+from rsa_vision.identify.densities import log_kernels, log_student, some_of, weighted_median
 from rsa_vision.identify.looks import FAINT, KIND, LEARNT_FROM, WIDE, Looks
 from rsa_vision.types import Bool, Float, Int
 
@@ -72,77 +72,84 @@ def _log_like(looks: Looks, pair: Float, alone: Alone, *, contrast: bool) -> tup
     second[:, 0] += looks.grown_b
     known_a: Bool = np.array(np.isfinite(first).all(axis=1))
     known_b: Bool = np.array(np.isfinite(second).all(axis=1))
+    first, second = np.nan_to_num(first), np.nan_to_num(second)  # what is not known weighs nothing
     unsure_a, unsure_b = looks.unsure[looks.a], looks.unsure[looks.b]
     # what a marker looks like is told by both images, as well as each is known
     weight_a = np.where(known_a, 1 / (KIND[0] ** 2 + unsure_a[:, 0] ** 2), 0.0)[:, None]
     weight_b = np.where(known_b, 1 / (KIND[0] ** 2 + unsure_b[:, 0] ** 2), 0.0)[:, None]
     both = np.maximum(weight_a + weight_b, 1e-9)
-    unsure = np.hypot(weight_a * unsure_a, weight_b * unsure_b) / both
-    of_ratio = np.hypot(unsure_a, unsure_b)
+    of_both = (weight_a * first + weight_b * second) / both
     clear = looks.quality == 0
     teachers = np.flatnonzero(known_a & known_b & clear[looks.a] & clear[looks.b] & (pair > FAINT))
     models, unlike = np.zeros((len(pair), 3 if contrast else 2)), np.zeros(len(pair))
     weights = pair[teachers] * ((looks.a[teachers] != looks.a[:, None]) & (looks.b[teachers] != looks.b[:, None]))
     told = (known_a | known_b) & (weights.sum(axis=1) >= LEARNT_FROM)
-    for e in np.flatnonzero(told):
-        free = teachers[weights[e] > 0]
-        weight = pair[free]
-        n = float(weight.sum())
-        slope, slope_sd = _slope(first[free] - second[free], weight)
-        shear = np.array([[1.0, 0.0], [-slope, 1.0]])[:, :d]  # sizes as they would be at one contrast
-        one, other = first @ shear, second @ shear
-        mean = (weight_a * np.nan_to_num(one) + weight_b * np.nan_to_num(other)) / both
-        ratios = one[free] - other[free]
+    unsure = np.hypot(weight_a * unsure_a, weight_b * unsure_b)[:, :d] / both
+    compared, of_ratio = first - second, np.hypot(unsure_a, unsure_b)
+    for at in some_of(np.flatnonzero(told), len(teachers)):  # of each of these (k), by its own teachers (t)
+        weight, paired = weights[at], known_a[at] & known_b[at]
+        n = weight.sum(axis=1)
+        slope, slope_sd = _slope(compared[teachers], weight)
+        mean, ratio = (_at_one_contrast(of[at], slope)[:, :d] for of in (of_both, compared))
+        means, ratios = (_at_one_contrast(np.tile(of[teachers], (len(at), 1, 1)), slope[:, None])[..., :d] for of in (of_both, compared))
         middle = weighted_median(ratios, weight)
-        deviation = np.abs(ratios - middle)
+        deviation = np.abs(ratios - middle[:, None])
         spread = np.maximum(1.4826 * weighted_median(deviation, weight), LEAST[:d])
-        spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL[:d] ** 2) / (n + USUAL_COUNT))
-        unlike[e] = weight[(deviation > FAR * spread).any(axis=1)].sum()
-        width = np.hypot(np.hypot(KIND[:d], unsure[e, :d]), spread / 2)
-        of_size, wide = width[:1], np.hypot(WIDE[:d], unsure[e, :d])
-        marker = _of_kinds(mean[e], mean[free], weight, width, wide)
-        if not (known_a[e] and known_b[e]):
-            models[e] = marker
-            continue
-        apart = float(first[e, 1] - second[e, 1] - weighted_median(first[free, 1:] - second[free, 1:], weight)[0])
-        error = np.hypot(of_ratio[e, :d], [slope_sd * apart, 0.0][:d])
-        wider = np.hypot(spread * np.sqrt(1 + 1 / n), error)
-        agree = log_student((one[e] - other[e] - middle) / wider, min(n, 4.0)) - np.log(wider)
-        models[e, 0] = marker + float(agree.sum())
-        of_pair = np.column_stack([mean, one - other])
-        width = np.hypot([*KIND[:d], *np.minimum(spread, USUAL[:d])], [*unsure[e, :d], *error])
-        models[e, 1] = log_kernels(of_pair[e], of_pair[free], weight, width, n)
+        spread = np.sqrt((n[:, None] * spread**2 + USUAL_COUNT * USUAL[:d] ** 2) / (n[:, None] + USUAL_COUNT))
+        unlike[at] = (weight * (deviation > FAR * spread[:, None]).any(axis=2)).sum(axis=1)
+        width, wide = np.hypot(np.hypot(KIND[:d], unsure[at]), spread / 2), np.hypot(WIDE[:d], unsure[at])
+        marker = _of_kinds(mean, means, weight, width, wide)
+        models[at] = marker[:, None]
+        apart = compared[at, 1] - weighted_median(np.tile(compared[teachers, 1:], (len(at), 1, 1)), weight)[:, 0]
+        error = np.hypot(of_ratio[at], np.stack([slope_sd * apart, np.zeros(len(at))], axis=1))[:, :d]
+        wider = np.hypot(spread * np.sqrt(1 + 1 / n)[:, None], error)
+        agree = log_student((ratio - middle) / wider, np.minimum(n, 4.0)[:, None]) - np.log(wider)
+        models[at[paired], 0] += agree[paired].sum(axis=1)
+        of_pair = np.hypot(np.hstack([np.tile(KIND[:d], (len(at), 1)), np.minimum(spread, USUAL[:d])]), np.hstack([unsure[at], error]))
+        like_one = log_kernels(np.hstack([mean, ratio]), np.concatenate([means, ratios], axis=2), weight, of_pair, n)
+        models[at[paired], 1] = like_one[paired]
         if contrast:
-            models[e, 2] = _of_kinds(mean[e, :1], mean[free, :1], weight, of_size, wide[:1]) + agree[0]
+            of_size = _of_kinds(mean[:, :1], means[..., :1], weight, width[:, :1], wide[:, :1]) + agree[:, 0]
             # of balls as large as this one: thicker balls take more light away
-            alike = weight * np.exp(log_student((mean[e, 0] - mean[free, 0]) / of_size[0], n))
-            for mine, sure in ((one, unsure_a), (other, unsure_b)):
-                models[e, 2] += log_kernels(mine[e, 1:], mine[free, 1:], alike, np.hypot(KIND[1:], sure[e, 1:]), n)
+            alike = weight * np.exp(log_student((mean[:, :1] - means[..., 0]) / width[:, :1], n[:, None]))
+            for of_one, sure in ((first[:, 1:], unsure_a), (second[:, 1:], unsure_b)):
+                theirs = np.tile(of_one[teachers], (len(at), 1, 1))
+                of_size += log_kernels(of_one[at], theirs, alike, np.hypot(KIND[1:], sure[at, 1:]), n)
+            models[at[paired], 2] = of_size[paired]
     result = np.logaddexp.reduce(models + np.log(_parts(models, teachers, weights)), axis=1)
     result -= known_a * alone.log_density[looks.a] + known_b * alone.log_density[looks.b]
     return np.where(told, result, 0.0), unlike
 
 
-def _of_kinds(value: Float, sample: Float, weight: Float, width: Float, wide: Float) -> float:
-    """Return the log density of what a marker looks like: like one of the others, or the only one of its kind."""
-    n = float(weight.sum())
+def _at_one_contrast(looks: Float, slope: Float) -> Float:
+    """Return looks (..., 2) with sizes as they would be at one contrast."""
+    return np.stack([looks[..., 0] - slope * looks[..., 1], looks[..., 1]], axis=-1)
+
+
+def _of_kinds(value: Float, sample: Float, weight: Float, width: Float, wide: Float) -> Float:
+    """Return the log density (k,) of what markers look like: like one of the others, or the only one of its kind."""
+    n = weight.sum(axis=-1)
     new = NEW_KIND[0] / (NEW_KIND[1] + n)
-    of_new = float((log_student((value - weighted_median(sample, weight)) / wide, 3.0) - np.log(wide)).sum())
-    return float(np.logaddexp(np.log1p(-new) + log_kernels(value, sample, weight, width, n), np.log(new) + of_new))
+    of_new = (log_student((value - weighted_median(sample, weight)) / wide, 3.0) - np.log(wide)).sum(axis=-1)
+    return np.asarray(np.logaddexp(np.log1p(-new) + log_kernels(value, sample, weight, width, n), np.log(new) + of_new))
 
 
-def _slope(ratios: Float, weight: Float) -> tuple[float, float]:
-    """Return how log sizes change with log contrasts, and its error, by the two images of each marker: a ball has one size."""
-    slope, slope_sd = 0.0, SLOPE
+def _slope(ratios: Float, weight: Float) -> tuple[Float, Float]:
+    """Return how log sizes change with log contrasts, and its error, by the two images (t, 2) of each marker: a ball has one size.
+
+    By every row (k, t) of weights, shape (k,).
+    """
+    slope, slope_sd = np.zeros(len(weight)), np.full(len(weight), SLOPE)
+    n = weight.sum(axis=1)
     for _ in range(TURNS):
-        rest = ratios[:, :1] - slope * ratios[:, 1:]
-        deviation = rest - weighted_median(rest, weight)
-        spread = max(1.4826 * float(weighted_median(np.abs(deviation), weight)[0]), LEAST[0])
-        spread = np.sqrt((weight.sum() * spread**2 + USUAL_COUNT * USUAL[0] ** 2) / (weight.sum() + USUAL_COUNT))
-        trust = weight * 5 / (4 + (deviation[:, 0] / spread) ** 2)  # Student's, of four degrees of freedom
-        size, contrast = (ratios - trust @ ratios / trust.sum()).T
-        normal = trust @ contrast**2 + (spread / SLOPE) ** 2
-        slope, slope_sd = float(trust @ (contrast * size) / normal), float(spread / np.sqrt(normal))
+        rest = (ratios[:, 0] - slope[:, None] * ratios[:, 1])[..., None]
+        deviation = (rest - weighted_median(rest, weight)[:, None])[..., 0]
+        spread = np.maximum(1.4826 * weighted_median(np.abs(deviation)[..., None], weight)[:, 0], LEAST[0])
+        spread = np.sqrt((n * spread**2 + USUAL_COUNT * USUAL[0] ** 2) / (n + USUAL_COUNT))
+        trust = weight * 5 / (4 + (deviation / spread[:, None]) ** 2)  # Student's, of four degrees of freedom
+        off = ratios - ((trust @ ratios) / trust.sum(axis=1, keepdims=True))[:, None]
+        normal = (trust * off[..., 1] ** 2).sum(axis=1) + (spread / SLOPE) ** 2
+        slope, slope_sd = (trust * off[..., 0] * off[..., 1]).sum(axis=1) / normal, spread / np.sqrt(normal)
     return slope, slope_sd
 
 
