@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
-from rsa_vision.detect.models.needle_tables import film_curve
+from rsa_vision.detect.models.needle_tables import by_film_curve, film_curve
 from rsa_vision.detect.models.needles import NeedleShape, arm_images, arms_by_optics
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float
@@ -87,7 +87,7 @@ def test_the_film_curve_follows_those_of_films(answer: Callable[[Float], Float],
     shown = (shown - shown[0]) / np.ptp(shown)
 
     def left(of: Float) -> Float:
-        return of[0] * film_curve(opacity, (of[1], of[2]))[0] - shown
+        return of[0] * film_curve(opacity, (of[1], of[2])) - shown
 
     best = least_squares(left, [1.0, 0.0, 0.0])
     assert np.sqrt(np.mean(best.fun**2)) < 0.004
@@ -96,7 +96,7 @@ def test_the_film_curve_follows_those_of_films(answer: Callable[[Float], Float],
 
 def test_derivatives_of_the_film_curve() -> None:
     opacity, step = np.linspace(0.0, 1.0, 21), 1e-5
-    _, *slopes = film_curve(opacity, (-0.8, 0.2))
+    slopes = by_film_curve(opacity, (-0.8, 0.2))
     for slope, by in zip(slopes, (np.array([step, 0]), np.array([0, step])), strict=True):
-        high, low = (film_curve(opacity, tuple(np.array([-0.8, 0.2]) + sign * by))[0] for sign in (1, -1))
+        high, low = (film_curve(opacity, tuple(np.array([-0.8, 0.2]) + sign * by)) for sign in (1, -1))
         np.testing.assert_allclose(slope, (high - low) / (2 * step), atol=1e-8)

@@ -9,7 +9,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, rfft2
+from scipy.fft import irfft2, next_fast_len, rfft2
 
 from rsa_vision.detect.models.profiles import TAIL, Optics
 from rsa_vision.types import Float
@@ -66,20 +66,14 @@ def _opacity(
     opacity = np.zeros((n_s, len(p)))
     opacity[rows, cols] = (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2]) / 4
 
-    def blurred(sigma: float) -> Float:
-        parts = (1 + along, cell_s), (1 - along, cell_p)
-        var_s, var_p = (max(part * sigma**2 / cell**2 - _OF_TABLE, 0.1) for part, cell in parts)
-        if oblique:
-            return _obliquely_blurred(opacity, var_s, var_p, oblique * sigma**2 / (cell_s * cell_p))
-        lengthwise = cv2.sepFilter2D(opacity, -1, _UNBLURRED, _kernel(var_s), borderType=cv2.BORDER_CONSTANT)
-        border = cv2.BORDER_REFLECT_101 if mirrored else cv2.BORDER_CONSTANT
-        return np.asarray(cv2.sepFilter2D(lengthwise, -1, _kernel(var_p), _UNBLURRED, borderType=border), np.float64)
-
-    seen = blurred(blurrier * optics.sigma_px)
-    if optics.tail:
-        seen += optics.tail * (blurred(TAIL * blurrier * optics.sigma_px) - seen)
+    lights = []  # part of the light, and the variances and covariance of its blur in cells
+    for part, sigma in ((1 - optics.tail, blurrier * optics.sigma_px), (optics.tail, TAIL * blurrier * optics.sigma_px)):
+        if part:
+            var_s, var_p = (max(by * (sigma / step) ** 2 - _OF_TABLE, 0.1) for by, step in ((1 + along, cell_s), (1 - along, cell_p)))
+            lights.append((part, var_s, var_p, oblique * sigma**2 / (cell_s * cell_p)))
+    seen = _obliquely_blurred(opacity, lights) if oblique else _blurred(opacity, lights, mirrored=mirrored)
     if any(optics.curve):
-        seen = film_curve(seen, optics.curve)[0]
+        seen = film_curve(seen, optics.curve)
     return np.concatenate([seen[:, :0:-1], seen], axis=1) if mirrored else seen
 
 
@@ -88,19 +82,39 @@ def _kernel(variance: float) -> Float:
     return np.asarray(cv2.getGaussianKernel(2 * int(_KERNEL * sigma + 0.5) + 1, sigma), np.float64)
 
 
-def _obliquely_blurred(image: Float, var_s: float, var_p: float, covariance: float) -> Float:
-    """Blur by a Gaussian of this covariance matrix, in cells; what leaves one end comes in at the other, where the image has faded."""
-    at_s, at_p = 2 * np.pi * np.fft.fftfreq(image.shape[0])[:, None], 2 * np.pi * np.fft.rfftfreq(image.shape[1])
-    passed = np.exp(-0.5 * (var_s * at_s**2 + 2 * covariance * at_s * at_p + var_p * at_p**2))
-    return np.asarray(irfft2(rfft2(image) * passed, s=image.shape), np.float64)
+def _blurred(image: Float, lights: list[tuple[float, float, float, float]], *, mirrored: bool) -> Float:
+    """Blur lengthwise and across; ``mirrored``: what lies before the first column is as what lies behind it."""
+    border = cv2.BORDER_REFLECT_101 if mirrored else cv2.BORDER_CONSTANT
+    out = np.zeros_like(image)
+    for part, var_s, var_p, _ in lights:
+        lengthwise = cv2.sepFilter2D(image, -1, _UNBLURRED, part * _kernel(var_s), borderType=cv2.BORDER_CONSTANT)
+        out += cv2.sepFilter2D(lengthwise, -1, _kernel(var_p), _UNBLURRED, borderType=border)
+    return out
+
+
+def _obliquely_blurred(image: Float, lights: list[tuple[float, float, float, float]]) -> Float:
+    """Blur by Gaussians with covariances; what leaves one end comes in at the other, beyond which it has faded."""
+    (rows, cols), widest = image.shape, lights[-1]
+    beyond_s, beyond_p = (int(_KERNEL / 2 * math.sqrt(variance)) for variance in widest[1:3])
+    padded = next_fast_len(rows + beyond_s), next_fast_len(cols + beyond_p, real=True)
+    at_s, at_p = 2 * np.pi * np.fft.fftfreq(padded[0])[:, None], 2 * np.pi * np.fft.rfftfreq(padded[1])
+    square_s, both, square_p = at_s**2, at_s * at_p, at_p**2
+    passed = sum(part * np.exp(-0.5 * (var_s * square_s + var_p * square_p) - by_both * both) for part, var_s, var_p, by_both in lights)
+    return np.asarray(irfft2(rfft2(image, s=padded) * passed, s=padded)[:rows, :cols], np.float64)
 
 
 def film_curve(opacity: Float, curve: tuple[float, float]) -> Float:
-    """What film shows of blurred opacities, and its derivatives by the two coefficients of :attr:`Optics.curve`: on a new first axis."""
+    """What film shows of blurred opacities, by the two coefficients of :attr:`Optics.curve`."""
     shifted = opacity / (opacity + math.exp(-curve[0]) * (1 - opacity))
     bow = shifted * (1 - shifted)
-    skewed = bow * (1 - 2 * shifted)
-    return np.stack([shifted + curve[1] * skewed, bow * (1 + curve[1] * (1 - 6 * bow)), skewed])
+    return np.asarray(shifted + curve[1] * bow * (1 - 2 * shifted), np.float64)
+
+
+def by_film_curve(opacity: Float, curve: tuple[float, float]) -> list[Float]:
+    """Derivatives of what film shows by the two coefficients of its curve."""
+    shifted = opacity / (opacity + math.exp(-curve[0]) * (1 - opacity))
+    bow = shifted * (1 - shifted)
+    return [bow * (1 + curve[1] * (1 - 6 * bow)), bow * (1 - 2 * shifted)]
 
 
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
@@ -151,7 +165,7 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
         wide, short = _opacity(*one, blurrier=factor), _opacity(half_width, length, taper - STEP, optics, slant)
         straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0)), slant)
         spread = _opacity(half_width, length, taper, replace(optics, tail=optics.tail + STEP), slant)
-        _, *by_curve = film_curve(straight, optics.curve)
+        by_curve = by_film_curve(straight, optics.curve)
         uneven = [
             _opacity(half_width, length, taper, replace(optics, uneven=(optics.uneven[0] + along, optics.uneven[1] + oblique)), slant)
             for along, oblique in ((STEP, 0.0), (0.0, STEP))
