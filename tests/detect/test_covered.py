@@ -27,10 +27,18 @@ def light_past_tees(
     for tip, part, turns, times in zip(tips, deep, turned, longer, strict=True):
         corner = tip.astype(int) - half
         line = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5
-        x, y = np.meshgrid(line + corner[0] - tip[0], line + corner[1] - tip[1])
-        origin, down = np.array([x * pitch_mm, y * pitch_mm, 0 * x]), np.array([0 * x, 0 * x, 0 * x + 1])
-        ways = [np.array([np.cos(a), -np.sin(a), 0.0]) for a in ARMS + turns]
-        chord = sum(chord_pin(origin, down, np.zeros(3), way, 2.0 * more, 0.25) for way, more in zip(ways, times, strict=True))
+        x, y = (pitch_mm * (line + first - at) for first, at in zip(corner, tip, strict=True))
+        chord = np.zeros((len(y), len(x)))
+        for angle, length in zip(ARMS + turns, 2.0 * times, strict=True):
+            way = np.array([np.cos(angle), -np.sin(angle), 0.0])
+            # nothing of it lies beyond the box around it
+            cols, rows = (
+                slice(*np.searchsorted(at, (min(0.0, end) - 0.25, max(0.0, end) + 0.25)))
+                for at, end in zip((x, y), length * way, strict=False)
+            )
+            across, down = np.meshgrid(x[cols], y[rows])
+            origin, through = np.array([across, down, 0 * down]), np.array([0 * down, 0 * down, 0 * down + 1])
+            chord[rows, cols] += chord_pin(origin, through, np.zeros(3), way, length, 0.25)
         light = np.exp(-MU_PER_MM * chord).reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
         clear[corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= 1 - part * (1 - light)
     return clear
