@@ -35,7 +35,7 @@ from rsa_vision.detect.needles.irregular import ARMS, Regularity, regular, told_
 from rsa_vision.detect.needles.penumbra import MOST as MOST_BLURRIER
 from rsa_vision.detect.needles.penumbra import Blurs, differing, equal
 from rsa_vision.detect.needles.sets import beside_each, clusters
-from rsa_vision.detect.needles.states import Sizes, State, Step, change_of, moved_optics, sizes_of
+from rsa_vision.detect.needles.states import Sizes, State, Step, change_of, moved_optics, of_usual_size, sizes_of
 from rsa_vision.types import Float
 
 _STEPS = 12
@@ -120,8 +120,8 @@ def fit_shared(
     start, slopes, since, of_blurs = optics, list[list[Float]](), np.full(OPTICS, np.inf), at.own_blurs
     last: list[Equations | None] = [None] * len(sets)
     before: tuple[State, list[Equations], Step] | None = None
-    converged, shorter, least = False, 0, np.inf
-    for count in range(steps + _MORE_STEPS + 1):
+    converged, restarted, shorter, least = False, False, 0, np.inf
+    for count in range(steps + 2 * _MORE_STEPS + 1):
         optics = moved_optics(start, at.moved)
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or np.abs(at.own_blurs - of_blurs).max() > _MUCH[1]:
             slopes = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)]
@@ -138,6 +138,11 @@ def fit_shared(
             told = [e.information() for e in compress(systems, telling)]
             normal = held + sum(matrix for matrix, _ in told)
             target = np.sum([right for _, right in told], axis=0)
+            if count == steps and not (converged or alike or restarted):
+                # some have gone astray, far from a straight line: tees of a film are of one size, and from there they all may get there
+                at, least, before, restarted = replace(at, sets=of_usual_size(at.sets)), np.inf, None, True
+                steps += _MORE_STEPS
+                continue
             if count == steps or converged:
                 break
             least, shorter = cost, 0

@@ -118,6 +118,12 @@ def sizes_of(systems: list[Equations], sets: list[list[NeedleFit]]) -> Sizes:
     return Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
 
 
+def of_usual_size(sets: list[list[NeedleFit]]) -> list[list[NeedleFit]]:
+    """Needles of the size that is usual among them."""
+    width, length = np.median([(f.shape.half_width_px, f.shape.length_px) for members in sets for f in members], axis=0).tolist()
+    return [[replace(f, shape=replace(f.shape, half_width_px=width, length_px=length)) for f in members] for members in sets]
+
+
 def change_of(normal: Float, target: Float, taper: float) -> Float:
     """Change of the common parameters, not too far at once; the taper stays within its bounds, the others follow."""
     change = np.linalg.solve(normal, target).astype(np.float64)
