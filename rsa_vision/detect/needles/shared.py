@@ -63,6 +63,7 @@ _NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.1])  # changes of those w
 _SHORTER = 3  # attempts at a step that loses nothing
 # side of squares than which all that is slower is left out, on bone; near enough the best for arms of half widths of 2.5 to 4
 _SQUARE_PX = 17
+_CLOSELY = 0.95  # explained of most, from which it is beyond doubt that they are of a kind: what texture has of them is less
 _GAIN = 0.2  # of the logarithm of the variance of tips, from which they are
 _ASKED = 8  # windows that tell whether it is to be
 
@@ -138,7 +139,7 @@ def fit_shared(
             told = [e.information() for e in compress(systems, telling)]
             normal = held + sum(matrix for matrix, _ in told)
             target = np.sum([right for _, right in told], axis=0)
-            if count == steps and not (converged or alike or restarted):
+            if count == steps and not (converged or alike or restarted) and np.median([f.explained for f in needles]) > _CLOSELY:
                 # some have gone astray, far from a straight line: tees of a film are of one size, and from there they all may get there
                 at, least, before, restarted = replace(at, sets=of_usual_size(at.sets)), np.inf, None, True
                 steps += _MORE_STEPS
