@@ -17,7 +17,7 @@ from rsa_vision.identify.hypotheses import largest_overlap
 from rsa_vision.types import MarkerImages
 from synthetic.point_films import FilmTruth, expose, random_exposure, random_foci, random_objects
 
-EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "60"))  # of each cage; thousands take minutes
+EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "40"))  # of each cage; thousands take minutes
 
 
 def identify(film: FilmTruth, cage: Cage, foci: tuple[int, ...], **options: object) -> CageIdentification:
