@@ -187,7 +187,11 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
         exam.note = f"another object than in the earlier examinations: none of its {len(new)} markers is among theirs"
     elif earlier:
         known = {name for other in earlier for name in other.names if not split_name(name)[0]}
-        exam.missing |= known - set(exam.names) - {name for other in earlier for name in other.unsure}
+        second = {name for other in earlier for name in other.unsure}
+        exam.missing |= known - set(exam.names) - second
+        if (doubted := sorted(second & set(exam.names), key=natural_key)) and (first := sorted(known - set(exam.names) - second)):
+            why = f"{', '.join(doubted)} may be {', '.join(first)}, as in an earlier examination that this one agrees with"
+            exam.findings.append(("constellation-ambiguous", why))
         exam.findings += _earlier_findings(exam, [left[a] for a in new], [left[a] for a in new if doubtful[a]], known)
         _name_hidden(exam, earlier[0], limits)
     return used

@@ -215,6 +215,20 @@ def test_names_given_twice_are_the_same_and_too_few_markers_are_never_named() ->
             assert all(row["flags"] == "missing" and row["n_views"] == 0 for row in missing)
 
 
+def test_a_name_that_may_be_a_second_one_is_doubted_as_long_as_the_first_is_missing() -> None:
+    body = np.random.default_rng(3).normal(0, 20, (8, 3))
+    moved = body + np.outer(np.arange(8) == 5, [0.9, -0.6, 0.8])
+    first, second, third, whole = follow_up(
+        [rows_of("1", body), rows_of("2", moved + 2), rows_of("3", moved - 3), rows_of("4", np.vstack([body, moved[5]]))], None, Limits()
+    )
+    assert first["exams"][0]["status"] == "ok"
+    for exam in (second, third):
+        assert {row["marker"] for row in exam["markers"] if row["x_mm"] is not None} == {f"P{k:02d}" for k in (1, 2, 3, 4, 5, 7, 8, 9)}
+        assert (exam["exams"][0]["status"], exam["exams"][0]["reasons"]) == ("review", "constellation-ambiguous")
+        assert "P09 may be P06" in exam["exams"][0]["message"]
+    assert whole["exams"][0]["status"] == "ok"  # both at once are two
+
+
 def test_doubtful_pairs_that_agree_with_the_segment_stay_in_review_and_it_says_so() -> None:
     body = np.random.default_rng(2).normal(0, 20, (5, 3))
     (named,) = follow_up([rows_of("1", body + 9, "ambiguous", "pair-ambiguous")], {"S": [Segment("a", tuple("12345"), body)]}, Limits())
