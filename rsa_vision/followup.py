@@ -188,10 +188,11 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
     elif earlier:
         known = {name for other in earlier for name in other.names if not split_name(name)[0]}
         second = {name for other in earlier for name in other.unsure}
-        exam.missing |= known - set(exam.names) - second
-        if (doubted := sorted(second & set(exam.names), key=natural_key)) and (first := sorted(known - set(exam.names) - second)):
-            why = f"{', '.join(doubted)} may be {', '.join(first)}, as in an earlier examination that this one agrees with"
-            exam.findings.append(("constellation-ambiguous", why))
+        absent, doubted = known - set(exam.names) - second, second & set(exam.names)
+        exam.missing |= absent
+        if absent and doubted:
+            may_be = " may be ".join(", ".join(sorted(names, key=natural_key)) for names in (doubted, absent))
+            exam.findings.append(("constellation-ambiguous", f"{may_be}, as in an earlier examination that this one agrees with"))
         exam.findings += _earlier_findings(exam, [left[a] for a in new], [left[a] for a in new if doubtful[a]], known)
         _name_hidden(exam, earlier[0], limits)
     return used

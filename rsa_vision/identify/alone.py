@@ -62,12 +62,12 @@ def images_alone(looks: Looks, paired: Float) -> Alone:
     broad = (log_student((value - middle) / np.hypot(wide, unsure), 3.0) - np.log(np.hypot(wide, unsure))).sum(axis=1)
     shares = _shares(quality, paired[one])
     odds = np.log(CLASSES * shares)[quality]
-    odds[known] += log_kernels(value[known], value[clear], of_pairs[clear], np.hypot(kind, unsure[known]), 2 * pairs)
-    odds[known] -= broad[known]
+    images = np.flatnonzero(known)
+    for at in some_of(images, int(clear.sum())):
+        odds[at] += log_kernels(value[at], value[clear], of_pairs[clear], np.hypot(kind, unsure[at]), 2 * pairs) - broad[at]
     hidden = _hidden(float(single @ expit(odds)), pairs)
     presumed = hidden * 2 * pairs
     of_image = np.zeros(len(one))
-    images = np.flatnonzero(known)
     for at in some_of(images, len(images)):  # among those fitted as well as this one, or as badly
         well = quality[at] == 0
         others = at[:, None] != images

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy.special import expit, gammaln
 
-from rsa_vision.identify.densities import log_kernels, log_student
+from rsa_vision.identify.densities import log_kernels, log_student, some_of
 from rsa_vision.identify.looks import KIND, UNSURE, WIDE
 from rsa_vision.types import Bool, Float, Int
 
@@ -53,10 +53,11 @@ def chance_of_marker(look: Float, place_px: Float, quality: Int, paired: Bool, s
     clear = teachers[quality[teachers] == 0]
     if len(clear):
         middle = np.median(look[clear], axis=0)
-        width = np.hypot(KIND, np.where((quality[lone] > 0)[:, None], UNSURE, 0.0))
-        marker = log_kernels(look[lone], look[clear], np.ones(len(clear)), width, len(clear))
-        anything = log_student((look[lone] - middle) / WIDE, 3.0) - np.log(WIDE)
-        odds += marker - anything.sum(axis=1)
+        for at in some_of(np.arange(len(lone)), len(clear)):
+            mine = look[lone[at]]
+            width = np.hypot(KIND, np.where((quality[lone[at]] > 0)[:, None], UNSURE, 0.0))
+            anything = (log_student((mine - middle) / WIDE, 3.0) - np.log(WIDE)).sum(axis=1)
+            odds[at] += log_kernels(mine, look[clear], np.ones(len(clear)), width, len(clear)) - anything
     result[lone] = expit(odds)
     return result
 

@@ -34,7 +34,7 @@ def light_past_tees(
             # nothing of it lies beyond the box around it
             cols, rows = (
                 slice(*np.searchsorted(at, (min(0.0, end) - 0.25, max(0.0, end) + 0.25)))
-                for at, end in zip((x, y), length * way, strict=False)
+                for at, end in zip((x, y), length * way[:2], strict=True)
             )
             across, down = np.meshgrid(x[cols], y[rows])
             origin, through = np.array([across, down, 0 * down]), np.array([0 * down, 0 * down, 0 * down + 1])

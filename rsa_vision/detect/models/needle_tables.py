@@ -105,16 +105,20 @@ def _obliquely_blurred(image: Float, lights: list[tuple[float, float, float, flo
 
 def film_curve(opacity: Float, curve: tuple[float, float]) -> Float:
     """What film shows of blurred opacities, by the two coefficients of :attr:`Optics.curve`."""
-    shifted = opacity / (opacity + math.exp(-curve[0]) * (1 - opacity))
-    bow = shifted * (1 - shifted)
-    return np.asarray(shifted + curve[1] * bow * (1 - 2 * shifted), np.float64)
+    shifted = _shifted(opacity, curve[0])
+    return np.asarray(shifted + curve[1] * shifted * (1 - shifted) * (1 - 2 * shifted), np.float64)
 
 
 def by_film_curve(opacity: Float, curve: tuple[float, float]) -> list[Float]:
     """Derivatives of what film shows by the two coefficients of its curve."""
-    shifted = opacity / (opacity + math.exp(-curve[0]) * (1 - opacity))
+    shifted = _shifted(opacity, curve[0])
     bow = shifted * (1 - shifted)
     return [bow * (1 + curve[1] * (1 - 6 * bow)), bow * (1 - 2 * shifted)]
+
+
+def _shifted(opacity: Float, by: float) -> Float:
+    """Opacities whose log odds are by so much more."""
+    return np.asarray(opacity / (opacity + math.exp(-by) * (1 - opacity)), np.float64)
 
 
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
