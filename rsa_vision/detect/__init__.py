@@ -85,7 +85,8 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
     seeds, signs = first_looks(values, candidates, pins, noise)
     found: list[tuple[float, Detection]] = []
     for seen in polarities(values, signs, seeds, pins, candidates, noise):
-        if found and found[0][0] > (_BEYOND * seen.weight if seen.rival else 0.0):
+        mottled = is_mottled(seeds, seen.sign, noise)
+        if found and found[0][0] > (_BEYOND * seen.weight if seen.rival else 0.0) and not (seen.rival and mottled):
             break
         bright = high_balls(seen.looks, seen.noise)
         if len(bright.depth) and not as_it_is:
@@ -93,7 +94,6 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
             if is_straighter(values, noise, other, its_noise, bright, seen.optics):
                 detection = _detect(other, BITS, its_noise, limit, as_it_is=True)
                 return replace(detection, images=in_film_values(detection.images, bits))
-        mottled = is_mottled(seeds, seen.sign, noise)
         images, evidence = marks_of(values, bits, seen, pins, candidates, faint, limit, mottled=mottled)
         found.append((evidence, Detection(images, seen.sign < 0, seen.optics, seen.noise)))
     return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)

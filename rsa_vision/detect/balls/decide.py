@@ -97,7 +97,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     ndarray of bool, shape (n,)
     """
     strength, height = over_clutter(fits), height_of(fits, sigma_px)
-    sure, close = _are_sure(fits, limit, sigma_px), misfit(fits, noise) < MISFIT
+    seen = noise.rises_above(height, fits.background)
+    sure, close = _are_sure(fits, limit, sigma_px) & seen, misfit(fits, noise) < MISFIT
     pattern, radii = _pattern(fits, sure & close, sigma_px)
     if len(radii) < LEAST_KNOWN:
         # noise hides what marks are like here: those without company have to be clearer, and among structure noise is no excuse
@@ -107,7 +108,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
         fair = whole & (close | ((fits.chi2_ring < _QUIET) & (not mottled))) & ~_soft_shadows(fits.radius_px, height, known)
         alone = fair & (strength > (_AMONG_MOTTLE if mottled else ALONE))
         among = fair & (_of_like_spread(spread, alone) >= LEAST_KNOWN) & (not mottled)
-        return np.asarray(known | alone | among | (_like_these(known, fits, height) & (strength > max(0.5 * SURE, limit))))
+        return np.asarray(known | alone | among | (_like_these(known, fits, height) & (strength > max(0.5 * SURE, limit)) & seen))
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
     least = np.where(close, FAINT, UNEXCUSED)
@@ -120,7 +121,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     if not mottled:  # smaller ones may be too faint for a pattern; where all around is noise, several of one size are marks as well
         quiet = sure & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.chi2_ring < _QUIET) & (strength > ALONE)
         alike |= quiet & (fits.radius_px < high) & (_of_like_spread(_spread(fits, sigma_px), quiet) >= LEAST_KNOWN)
-    return np.asarray((fits.significance > limit) & alike & (sure | (strength > 0.5 * SURE)))
+    return np.asarray((fits.significance > limit) & seen & alike & (sure | (strength > 0.5 * SURE)))
 
 
 def show_what_marks_are_like(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> bool:

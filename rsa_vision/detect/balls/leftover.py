@@ -56,6 +56,8 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least
     NoiseModel
         The same where too few tell, and where there is no more noise; without values beyond a gap, as shutters have.
     """
+    if noise.is_lossy:  # free places are quieter than anything around marks
+        return noise
     clear = over_clutter(seeds) > SURE * np.sqrt(noise.gain(np.hypot(COARSE_SIGMA_PX, 0.5 * seeds.radius_px)))
     sure = seeds.rows(clear & (seeds.valid_fraction > _WHOLE) & (seeds.window_fraction > _INSIDE))
     if _pixels(sure) < least_pixels:
@@ -192,7 +194,7 @@ def noise_under(uneven: Float, radius_px: Float, quiet: float, places: list[Plac
     beside = np.concatenate([np.zeros(0), *left])
     if len(beside) < LEAST:
         return 1.0
-    usual = usual_square(beside)
+    usual = max(usual_square(beside), float(noise.is_lossy))
     return at_rims(usual_square(uneven) / usual) if usual > _NOTHING else 1.0
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.balls.decide import over_clutter
 from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.find import (
     COARSE_MU_PX,
@@ -43,6 +44,7 @@ _MOST_TRIED, _MOST_SEEDS = 40, 40
 _WHOLE, _INSIDE = (0.98, 0.8), 0.8  # of the pixels under a ball, most first, and of its window
 _SURER = 3.0  # times the significance of what is a part of another
 _SPECKS = 0.5  # of all the evidence that there is
+_BY_CHANCE = 4.0  # significance that there is plenty of on any film: dozens of specks are no rival for a few balls
 _SHARP = 0.4  # part of the tolerated misfit that balls leave once the blur is right; other blobs leave more
 _CLOSE, _UNLIKE = 0.05, 3.0  # misfit and what is not explained: of any ball, or against the closest quarter
 _MUCH_MORE = 1.5  # times the variance
@@ -51,11 +53,11 @@ OF_CUT_OFF = 0.2  # of the evidence of a whole mark, of one that is cut off: pla
 
 
 def ball_evidence(fits: BallFits, noise: NoiseModel) -> float:
-    """Return how much the fits speak for balls: significances, weighted by how closely the model describes each."""
+    """Return how much the fits speak for balls: significances over noise and structure, weighted by how closely each is described."""
     rest = np.maximum(misfit(fits, noise) / MISFIT, (1 - fits.explained) / (1 - EXPLAINED))
     whole = (fits.valid_fraction > 0.95) & (fits.window_fraction > 0.8)
     say = np.where(whole, 1.0, OF_CUT_OFF)
-    return float(say @ (np.minimum(fits.significance, CAP) * np.exp(-((rest / _SHARP) ** 2))))
+    return float(say @ (np.clip(over_clutter(fits) - _BY_CHANCE, 0.0, CAP) * np.exp(-((rest / _SHARP) ** 2))))
 
 
 def estimate_optics(film: NDArray[Any], seeds: BallFits, noise: NoiseModel) -> tuple[Optics, float]:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.special import chdtri
 
+from rsa_vision.detect.film.compression import noise_of_compression
 from rsa_vision.detect.film.repairs import repaired_lines
 from rsa_vision.detect.film.tiles import ENOUGH_TILES, NO_NOISE, QUANTISATION, roughness, skewness, tiles_of, whole_tiles, without_surfaces
-from rsa_vision.types import Float, Int
+from rsa_vision.types import Bool, Float, Int
 
 TILE = 32  # pixels; small enough that quiet anatomy is nearly a quadratic surface, large enough to hold correlated noise
 STEEP, POWER = 1.25, 6.0  # variance grows at most by this from class to class, and with this power of the value
@@ -36,6 +37,7 @@ _WHITE = 0.03  # correlation with the nearest neighbours below which noise count
 
 _GAP, _BEYOND_MARKS = 0.5, 0.6  # of the height of marks: a gap in the values of tiles, and how far away what lies behind it has to be
 _LEAST_LEVELS = 4  # this side of it
+_WAVES = 1.5  # times the height of those of one coefficient, that several at a place come to
 
 _NO_LINES = np.zeros(0, np.intp)
 
@@ -54,6 +56,8 @@ class NoiseModel:
         Values at or beyond them are saturated and carry no information.
     repaired : tuple of ndarrays of int
         Columns and rows that were made up from those beside them, as of :func:`rsa_vision.detect.film.repairs.repaired_lines`.
+    pattern : float
+        Height, in standard deviations, of the waves that lossy compression makes out of nothing; 0 where it did not.
     """
 
     level: Float
@@ -62,10 +66,20 @@ class NoiseModel:
     floor: float
     ceiling: float
     repaired: tuple[Int, Int] = (_NO_LINES, _NO_LINES)
+    pattern: float = 0.0
 
     def variance_at(self, values: Float) -> Float:
         """Return the variance of pixels with these expected values (same shape)."""
         return np.interp(values, self.level, self.variance)
+
+    @property
+    def is_lossy(self) -> bool:
+        """Most of the noise are errors of lossy compression, around marks and edges: even film has none."""
+        return self.pattern > 0
+
+    def rises_above(self, height: Float, background: Float) -> Bool:
+        """Say which images, of heights without sign on these backgrounds (same shape), lossy compression has not made."""
+        return np.asarray(height > _WAVES * self.pattern * np.sqrt(self.variance_at(background)))
 
     def carried_on(self, value: float, variance: float) -> NoiseModel:
         """Return the same noise with its curve carried on beyond its end to a value and the variance there, in units of that at the end.
@@ -231,7 +245,12 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < NO_NOISE else 0.0
     variance = np.maximum(curve_array / bias, max(QUANTISATION, least))
-    return NoiseModel(level_array, variance, correlation, floor, ceiling, repaired_lines(film))
+    lossy, pattern = noise_of_compression(film, LAGS, floor, ceiling), 0.0
+    if lossy is not None:  # where it left nothing to see there is no noise either
+        more = lossy.variance > np.median(variance)  # else what is rounded has noise enough to be wrong by chance
+        correlation, pattern = (lossy.correlation, lossy.pattern / np.sqrt(lossy.variance)) if more else (correlation, 0.0)
+        variance = np.maximum(variance, lossy.variance)
+    return NoiseModel(level_array, variance, correlation, floor, ceiling, repaired_lines(film), pattern)
 
 
 def _blurred(blur_px: Float) -> Float:

@@ -126,9 +126,14 @@ def _find_needles(
     places = _likeliest_first(faint)
     lines = _long_places(mine, seen.looks)
     pins, pin_optics = find_pins(film, rough_pins, places[~on_arms(places, perhaps)], lines, perhaps, sign, optics, noise)
-    pins = [p for p in pins if is_located(p)]
+    tees, pins = [_seen(tees, noise), _seen([p for p in pins if is_located(p)], noise)]
     painted = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
     return _Needles(tees, pins, doubtful, tee_optics, off_pins(seen.looks, more_pins), painted)
+
+
+def _seen(needles: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
+    """Leave out what lossy compression may have made."""
+    return [fit for fit in needles if noise.rises_above(np.array(abs(fit.height)), np.array(fit.background))]
 
 
 def _long_places(mine: Candidates, looks: BallFits) -> Float:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import CLOSE, faint_beside
+from rsa_vision.detect.balls.decide import CLOSE, faint_beside, height_of
 from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, ROUNDNESS, STRENGTH, distinct, first_look
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import BESIDE_NEEDLES, noise_at_marks
@@ -107,7 +107,8 @@ def first_looks(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit
 
 
 def _look(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> BallFits:
-    return off_pins(first_look(film, candidates, noise), pins)
+    looks = first_look(film, candidates, noise)
+    return off_pins(looks.rows(noise.rises_above(height_of(looks, COARSE_SIGMA_PX), looks.background)), pins)
 
 
 def off_pins(fits: BallFits, pins: list[NeedleFit]) -> BallFits:

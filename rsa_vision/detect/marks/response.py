@@ -52,7 +52,7 @@ def log_odds(film: NDArray[Any], bits: int, noise: NoiseModel) -> tuple[NDArray[
     table = np.rint(top * scale.part(np.arange(scale.full + 1.0))).astype(np.uint16)
     floor, ceiling = (float(table[int(end)]) if 0 <= end <= scale.full else end for end in (noise.floor, noise.ceiling))
     variance = noise.variance * np.square(top * scale.slope(level)) + QUANTISATION
-    other = NoiseModel(top * scale.part(level), variance, noise.correlation, floor, ceiling, noise.repaired)
+    other = NoiseModel(top * scale.part(level), variance, noise.correlation, floor, ceiling, noise.repaired, noise.pattern)
     return np.asarray(table[np.minimum(film, scale.full)]), other
 
 

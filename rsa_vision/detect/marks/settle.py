@@ -273,6 +273,8 @@ def _held_over(values: NDArray[Any], near: Int, estimator: Float, known: Modes, 
 
 def _least(noise: NoiseModel) -> float:
     """Part of the promised squared errors that can be all there is: less is not believed of areas of one value, nor of white noise."""
+    if noise.is_lossy:  # places where there was nothing have lost nothing
+        return 1.0
     return _QUIETEST if noise.is_white or noise.typical_sd**2 < _ROUNDED else _NONE
 
 

@@ -145,7 +145,7 @@ def table_of(
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
     # of what is small against the blur hardly any of its depth is seen
     high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
-    trust = np.where(poor, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
+    trust = np.where(poor | (flags & MarkerFlag.UNLIKE > 0), 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
 
 
