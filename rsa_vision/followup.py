@@ -17,7 +17,7 @@ from rsa_vision.flags import MarkerFlag, flag_names, flag_value
 from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.constellation import LOOSE_SIGMA, Known, match_bodies, match_segments
 from rsa_vision.identify.hidden import Sighting
-from rsa_vision.identify.poses import Cloud, place
+from rsa_vision.identify.poses import Cloud, Pairs, place
 from rsa_vision.ordering import natural_key
 from rsa_vision.segments import Segment, Segments, segments_of
 from rsa_vision.settings import Limits
@@ -168,10 +168,9 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
         bodies, doubts = match_bodies(old, points, limits.posterior)
         doubtful |= doubts
         for body in bodies:
-            placement = place(old, points, body) if len(body) >= LEAST_POINTS else None
-            for k, (i, a) in enumerate(body):
+            for (i, a), moved in zip(body, _have_moved(body, bodies, old, points), strict=True):
                 given.setdefault(a, set()).add(other.names[before[i]])
-                if placement is not None and placement.sigmas[k] > LOOSE_SIGMA:
+                if moved:
                     exam.flags[left[a]] |= MarkerFlag.LOOSE
     once = [name for names in given.values() for name in names]
     agreed = {a: next(iter(names)) for a, names in given.items() if len(names) == 1 and once.count(next(iter(names))) == 1}
@@ -196,6 +195,22 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
         exam.findings += _earlier_findings(exam, [left[a] for a in new], [left[a] for a in new if doubtful[a]], known)
         _name_hidden(exam, earlier[0], limits)
     return used
+
+
+def _have_moved(body: Pairs, bodies: Sequence[Pairs], before: Cloud, points: Cloud) -> list[bool]:
+    """Say which markers of a rigid group are not where its others say; of too small a group, where none of the larger ones does.
+
+    Some of a larger group may have been enough to name a marker that all of it would not.
+    """
+
+    def sigmas(pairs: Pairs) -> list[float]:
+        placement = place(before, points, pairs)
+        return [0.0] * len(pairs) if placement is None else placement.sigmas.tolist()
+
+    if len(body) >= LEAST_POINTS:
+        return [sigma > LOOSE_SIGMA for sigma in sigmas(body)]
+    whole = [other for other in bodies if len(other) >= LEAST_POINTS]
+    return [bool(whole) and all(sigmas((*other, pair))[-1] > LOOSE_SIGMA for other in whole) for pair in body]
 
 
 def _name_hidden(exam: _Exam, first: _Exam, limits: Limits) -> None:
