@@ -143,9 +143,11 @@ def table_of(
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
-    # of what is small against the blur hardly any of its depth is seen
-    high = np.concatenate([height_of(balls, optics.sigma_px), depth[n:]]) / np.sqrt(noise.variance_at(background))
-    trust = np.where(poor | (flags & MarkerFlag.UNLIKE > 0), 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
+    # of what is small against the blur hardly any of its depth is seen; texture has specks as high as marks, and more that are none
+    over_structure = height_of(balls, optics.sigma_px) / np.sqrt(np.clip(balls.chi2_ring, 1.0, EDGE))
+    high = np.concatenate([over_structure, depth[n:]]) / np.sqrt(noise.variance_at(background))
+    doubted = poor | (flags & MarkerFlag.UNLIKE > 0)
+    trust = np.where(doubted, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0))) * np.mean(~doubted) if n + m else np.zeros(0)
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
 
 

@@ -107,9 +107,10 @@ def _found_from(
     _, taper, sample = _likeliest(film, [f for f in sample if is_pin(f, noise)], [optics], noise)  # a wide blur feigns a short point
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
-    fits = [[_refit(film, replace(f, shape=shape), optics, noise) for shape in shapes] for f, shapes in zip(rough, starts, strict=True)]
+    even = replace(optics, uneven=(0.0, 0.0))  # which way of those is the best does not hang on that, and it takes a table for each angle
+    fits = [[_refit(film, replace(f, shape=shape), even, noise) for shape in shapes] for f, shapes in zip(rough, starts, strict=True)]
     if len(trials) > 1:  # optics were guessed at first: whichever way round a pin began says little
-        fits = [[*ways, *(_refit_turned(film, f, optics, noise) for f in ways)] for ways in fits]
+        fits = [[*ways, *(_refit_turned(film, f, even, noise) for f in ways)] for ways in fits]
     pins = [min(ways, key=unexplained) for ways in fits]
     pins = pointed(film, distinct(_still(pins, noise)), optics, noise)
     pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
