@@ -57,20 +57,19 @@ def test_balls_at_rims_of_implants(density: float, from_rim: float) -> None:
 
 
 def test_balls_at_corners_of_implants_are_where_they_are_said_to_be() -> None:
-    ratios: list[float] = []
-    for seed in (1, 2):
-        rng = np.random.default_rng(seed)
-        axis = np.arange(55, SIDE, 85.0)
-        balls = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        balls = balls + rng.uniform(-3, 3, balls.shape)
-        at_corner = np.arange(len(balls)) % 2 == 1
-        away, z = misses(detect_markers(among_corners(balls, at_corner, rng), bits=16).images, balls)
-        seen = away < 2.0
-        assert seen[~at_corner].all()
-        ratios += z[seen & at_corner].tolist()
-    print(f"{len(ratios)} found, error / sd {np.sqrt(np.mean(np.square(ratios))):.2f}, largest {max(ratios):.1f}")
+    rng = np.random.default_rng(1)
+    axis = np.arange(55, SIDE, 85.0)
+    balls = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    balls = balls + rng.uniform(-3, 3, balls.shape)
+    at_corner = np.arange(len(balls)) % 2 == 1
+    away, z = misses(detect_markers(among_corners(balls, at_corner, rng), bits=16).images, balls)
+    seen = away < 2.0
+    assert seen[~at_corner].all()
+    ratios = z[seen & at_corner]
+    print(f"{len(ratios)} found, error / sd {np.sqrt(np.mean(np.square(ratios))):.2f}, largest {ratios.max():.1f}")
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4  # a corner is not told from an edge everywhere
-    assert max(ratios) < 4.5
+    assert len(ratios) >= 0.5 * at_corner.sum()  # the others are lost in what their corners leave
+    assert ratios.max() < 4.5
 
 
 def among_corners(balls: Float, at_corner: Bool, rng: np.random.Generator) -> NDArray[Any]:
