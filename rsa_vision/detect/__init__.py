@@ -86,7 +86,8 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
     found: list[tuple[float, Detection]] = []
     for seen in polarities(values, signs, seeds, pins, candidates, noise):
         mottled = is_mottled(seeds, seen.sign, noise)
-        if found and found[0][0] > (_BEYOND * seen.weight if seen.rival else 0.0) and not (seen.rival and mottled):
+        # where both show nearly as much, first looks do not say which is which
+        if found and found[0][0] > (0.0 if not seen.rival else np.inf if mottled else _BEYOND * seen.weight):
             break
         bright = high_balls(seen.looks, seen.noise)
         if len(bright.depth) and not as_it_is:

@@ -194,7 +194,7 @@ def noise_under(uneven: Float, radius_px: Float, quiet: float, places: list[Plac
     beside = np.concatenate([np.zeros(0), *left])
     if len(beside) < LEAST:
         return 1.0
-    usual = max(usual_square(beside), float(noise.is_lossy))
+    usual = max(usual_square(beside), 1.0 if noise.is_lossy else 0.0)  # places where there was nothing have lost nothing
     return at_rims(usual_square(uneven) / usual) if usual > _NOTHING else 1.0
 
 

@@ -147,8 +147,9 @@ def table_of(
     over_structure = height_of(balls, optics.sigma_px) / np.sqrt(np.clip(balls.chi2_ring, 1.0, EDGE))
     high = np.concatenate([over_structure, depth[n:]]) / np.sqrt(noise.variance_at(background))
     doubted = poor | (flags & MarkerFlag.UNLIKE > 0)
-    trust = np.where(doubted, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0))) * np.mean(~doubted) if n + m else np.zeros(0)
-    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), float(trust @ np.minimum(high, CAP))
+    trust = np.where(doubted, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
+    evidence = float(trust @ np.minimum(high, CAP)) * np.count_nonzero(~doubted) / max(n + m, 1)
+    return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), evidence
 
 
 def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
