@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsa_vision.detect.balls.equations import invert, polynomial
-from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits, slopes
+from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits
+from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
 from rsa_vision.detect.balls.surroundings import Modes
 from rsa_vision.detect.balls.usual import Proportion, Size
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.whitening import whiten_rows
-from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 _NONE = 1e-3  # of the noise: what is not there
@@ -38,6 +39,12 @@ class Common:
     size: Size
     proportion: Proportion
     differ: float  # of structure from window to window: standard deviation of its logarithm
+    spot: Spot | None = None  # that draws them, if it is no Gaussian
+
+    @property
+    def rim_px(self) -> float:
+        """How far beyond their radius balls are seen."""
+        return self.optics.sigma_px + (self.spot.reach_px if self.spot else 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +99,6 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
     Solution
     """
     fits, half, noise, sigma_px = windows.fits, windows.half, common.noise, common.optics.sigma_px
-    table = ball_table(round(common.optics.mu_px * sigma_px, 3))
     rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
     surface = np.concatenate([polynomial(half, cols - half, rows - half), known.surface], axis=1).T
     local, radius, depth = fits.position_px - windows.corner_px, fits.radius_px, fits.depth
@@ -102,7 +108,7 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
     precision[:, 2], precision[:, _PER_BALL:] = held, _precision(known, structure, fits, noise)
     each, far = np.arange(precision.shape[1]), True
     for step in range(_STEPS):
-        shapes = slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, sigma_px)
+        shapes = shapes_of(common.optics, common.spot, cols - local[:, :1], rows - local[:, 1:], radius)
         value, *by = (shape.astype(np.float64) for shape in shapes)
         ball = depth[:, None] * value
         left = windows.data - ball

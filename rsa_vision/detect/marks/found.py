@@ -18,7 +18,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.marks.noise_curve import noise_by_value
 from rsa_vision.detect.marks.polarity import Seen, off_pins
-from rsa_vision.detect.marks.resolve import resolve_balls
+from rsa_vision.detect.marks.resolve import Balls, resolve_balls
 from rsa_vision.detect.marks.second_look import look_again
 from rsa_vision.detect.marks.settle import STRUCTURE, settle
 from rsa_vision.detect.marks.table import WHOLE, table_of, what_is_left
@@ -149,29 +149,9 @@ def _likeliest_first(candidates: Candidates) -> Float:
     return np.concatenate([candidates.position_px, candidates.strokes[:, :2]])[np.argsort(-strength)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Balls:
-    """Balls of a film."""
-
-    fits: BallFits
-    touching: Bool  # (n,): fitted together with a neighbour, or perhaps two
-    edged: Bool  # (n,): fitted together with an edge
-    drawn: Bool  # (n,): fitted without some pixels, or with the film's focal spot
-
-    def rows(self, which: Bool) -> _Balls:
-        return _Balls(self.fits.rows(which), self.touching[which], self.edged[which], self.drawn[which])
-
-    def and_more(self, fits: BallFits, *, touching: Bool | bool, edged: Bool | bool, drawn: Bool | bool) -> _Balls:
-        flags = (
-            np.append(now, np.broadcast_to(more, len(fits.depth)))
-            for now, more in ((self.touching, touching), (self.edged, edged), (self.drawn, drawn))
-        )
-        return _Balls(join([self.fits, fits]), *flags)
-
-
 def _find_balls(
     film: NDArray[Any], mine: Candidates, faint: Candidates, needles: _Needles, seen: Seen, limit: float, *, mottled: bool
-) -> tuple[_Balls, list[NeedleFit]]:
+) -> tuple[Balls, list[NeedleFit]]:
     """Balls, and the tees with those that only a ball on them explains."""
     sign, optics, noise, others = seen.sign, seen.optics, seen.noise, needles.all
 
@@ -185,13 +165,13 @@ def _find_balls(
     def decided(fits: BallFits) -> Bool:
         return are_balls(fits, limit, optics.sigma_px, noise, mottled=mottled)
 
-    found = _Balls(*resolve_balls(film, mine, needles.looks, limit, optics, noise, needles.painted))
+    found = resolve_balls(film, mine, needles.looks, limit, optics, noise, needles.painted)
     found = found.rows(high(found.fits))
     found = found.rows(decided(found.fits) & bare(found.fits))
     more, at_edge, crossed = look_again(film, faint, found.fits, limit, optics, noise, needles.painted)
     like = decided(join([found.fits, more]))[len(found.fits.depth) :] & bare(more) & high(more)
     # the last fit does not know what was masked either
-    found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], drawn=crossed[like])
+    found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], crossed=crossed[like])
     if len(found.fits.depth) and not show_what_marks_are_like(found.fits, limit, optics.sigma_px, noise):
         found = found.rows(look_clear(found.fits, noise) | out_of_a_crowd(found.fits, _off_needles(faint, others)))
     tees = needles.tees
@@ -199,7 +179,7 @@ def _find_balls(
         if both := part(film, fit, found.fits, optics, needles.tee_optics, noise, needles.painted or _nothing, is_tee):
             tee, ball = both
             found = found.rows(np.hypot(*(found.fits.position_px - ball.position_px[0]).T) > ball.radius_px[0])
-            found, tees = found.and_more(ball, touching=True, edged=False, drawn=False), [*tees, tee]
+            found, tees = found.and_more(ball, touching=True, edged=False, crossed=False), [*tees, tee]
     return found, tees
 
 
@@ -215,22 +195,22 @@ class _Around:
 
     places: list[Places]
     free: Bool  # (n,): balls fitted alone
-    clear: Int  # those of them with nothing on them or beside them
+    clear: Int  # those of them with nothing on them or beside them, and no other spot than the Gaussian
     under: float  # variance of the noise under balls, in units of that beside them
 
 
-def _around(film: NDArray[Any], found: _Balls, needles: _Needles, optics: Optics, noise: NoiseModel) -> _Around:
+def _around(film: NDArray[Any], found: Balls, needles: _Needles, optics: Optics, noise: NoiseModel) -> _Around:
     known, others = found.fits, needles.all
     place = np.array([t.position_px for t in others]).reshape(-1, 2)
     reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
     places = free_places(film, known, place, reach, optics, noise)
-    free = ~found.touching & ~found.drawn
-    clear = np.flatnonzero(free & (known.valid_fraction > WHOLE) & (known.chi2_ring < STRUCTURE))
+    free = ~found.touching & ~found.crossed
+    clear = np.flatnonzero(free & ~found.drawn & (known.valid_fraction > WHOLE) & (known.chi2_ring < STRUCTURE))
     return _Around(places, free, clear, noise_under(known.chi2_uneven[clear], known.radius_px[clear], STRUCTURE, places, optics, noise))
 
 
 def _measured(
-    film: NDArray[Any], bits: int, found: _Balls, needles: _Needles, around: _Around, faint: Candidates, optics: Optics, noise: NoiseModel
+    film: NDArray[Any], bits: int, found: Balls, needles: _Needles, around: _Around, faint: Candidates, optics: Optics, noise: NoiseModel
 ) -> tuple[MarkerImages, float]:
     """Where the marks are, with their errors and flags, and how much they speak for their polarity."""
     known, touching, painted, others = found.fits, found.touching, needles.painted, needles.all
@@ -243,7 +223,7 @@ def _measured(
     if curve is not None:
         known = replace(known, covariance=under * known.covariance, chi2_uneven=known.chi2_uneven / under)
         noise, under = curve, 1.0
-    balls, ratio, by_size, covered = settle(film, known, around.places, under, free, found.edged, beside, optics, noise)
+    balls, ratio, by_size, covered = settle(film, replace(found, fits=known), around.places, under, free, beside, optics, noise)
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
         over = painted.under(balls.position_px, balls.radius_px) > _OVER * np.abs(balls.depth)
         touching, by_size = touching | over, by_size + over * (_PULL * balls.radius_px) ** 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from rsa_vision.detect.balls.decide import LEAST_KNOWN, hopeless, look_clear
 from rsa_vision.detect.balls.find import CHANCE, COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.balls.fits import BallFits, join
+from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
@@ -31,6 +33,50 @@ _COMPANY, _COARSE = 3, 0.6  # peaks beside one that a group may start from; of t
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Balls:
+    """Balls of a film.
+
+    Attributes
+    ----------
+    fits : BallFits
+    touching : ndarray of bool, shape (n,)
+        Fitted together with a neighbour, or perhaps two.
+    edged : ndarray of bool, shape (n,)
+        Fitted together with an edge.
+    crossed : ndarray of bool, shape (n,)
+        Fitted without the pixels that something else lies on.
+    drawn : ndarray of bool, shape (n,)
+        Fitted with the film's focal spot.
+    by_spot : ndarray of shape (n, 2, 2)
+        As of :class:`rsa_vision.detect.neighbours.spots.Drawn`; zero for the others.
+    spot : Spot or None
+    """
+
+    fits: BallFits
+    touching: Bool
+    edged: Bool
+    crossed: Bool
+    drawn: Bool
+    by_spot: Float
+    spot: Spot | None
+
+    def rows(self, which: Bool) -> Balls:
+        """Return those that ``which`` selects."""
+        touching, edged, crossed, drawn = (of[which] for of in (self.touching, self.edged, self.crossed, self.drawn))
+        return Balls(self.fits.rows(which), touching, edged, crossed, drawn, self.by_spot[which], self.spot)
+
+    def and_more(self, fits: BallFits, *, touching: Bool | bool, edged: Bool | bool, crossed: Bool | bool) -> Balls:
+        """Return these and others, of which none is drawn by the spot."""
+        n = len(fits.depth)
+        touching, edged, crossed, drawn = (
+            np.append(now, np.broadcast_to(more, n))
+            for now, more in ((self.touching, touching), (self.edged, edged), (self.crossed, crossed), (self.drawn, False))
+        )
+        by_spot = np.concatenate([self.by_spot, np.zeros((n, 2, 2))])
+        return Balls(join([self.fits, fits]), touching, edged, crossed, drawn, by_spot, self.spot)
+
+
 def resolve_balls(
     film: NDArray[Any],
     candidates: Candidates,
@@ -39,7 +85,7 @@ def resolve_balls(
     optics: Optics,
     noise: NoiseModel,
     needles: Painted | None,
-) -> tuple[BallFits, Bool, Bool, Bool]:
+) -> Balls:
     """Fit all balls of a film.
 
     Parameters
@@ -58,29 +104,22 @@ def resolve_balls(
 
     Returns
     -------
-    fits : BallFits
-        Those that are balls.
-    touching : ndarray of bool, shape (n,)
-        Fitted together with a neighbour, or perhaps two.
-    edged : ndarray of bool, shape (n,)
-        Fitted together with an edge.
-    drawn : ndarray of bool, shape (n,)
-        Fitted with the film's focal spot.
+    Balls
     """
     worth = ~hopeless(seeds, COARSE_SIGMA_PX, noise)
     if needles is not None and np.count_nonzero(look_clear(seeds, noise)) >= LEAST_KNOWN:  # else these too are asked what balls are like
         worth &= ~needles.explain(film, seeds.position_px, seeds.radius_px)
     seeds = seeds.rows(worth)
     if len(seeds.depth) == 0:
-        return seeds, np.zeros(0, bool), np.zeros(0, bool), np.zeros(0, bool)
+        none = np.zeros(0, bool)
+        return Balls(seeds, none, none, none, none, np.zeros((0, 2, 2)), None)
     tees: Background | None = needles
     others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-    drawn, spot, in_doubt = find_spot(film, single.rows(~clean), single.rows(clean & look_clear(single, noise)), optics, noise, others)
-    if spot is not None:
-        rest = ~_taken(single, drawn)
-        single, clean, tees = single.rows(rest), clean[rest], with_spot(tees, drawn, spot, optics)
+    drawn = find_spot(film, single.rows(~clean), single.rows(clean), optics, noise, others)
+    rest = ~_taken(single, drawn.fits)
+    single, clean, tees = single.rows(rest), clean[rest], with_spot(tees, drawn.fits, drawn.spot, optics)
     good = single.rows(plausible(single, noise, slack=1.5))
 
     def groups_worth_fitting() -> list[list[int]]:
@@ -127,7 +166,7 @@ def resolve_balls(
         fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
     found = join([single.rows(slice(0)), *fits])
     found = found.rows(~_cancelled(found))
-    found = found.rows(inside(found, film) & ~_taken(found, drawn))
+    found = found.rows(inside(found, film) & ~_taken(found, drawn.fits))
     balls = plausible(found, noise)
     alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
     perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
@@ -138,13 +177,14 @@ def resolve_balls(
     found, edged = beside_edges(film, found, optics, noise, tees)
     balls = plausible(found, noise)
     found, edged = found.rows(balls), edged[balls]
-    by_spot = np.arange(len(found.depth) + len(drawn.depth)) >= len(found.depth)
-    found, edged = join([found, drawn]), np.append(edged, np.zeros(len(drawn.depth), bool))
-    touching = np.zeros(len(found.depth), bool)
-    for g in groups_of(found, optics):
-        touching[g] = len(g) > 1
-    touching[by_spot] |= in_doubt
-    return found, touching, edged, by_spot
+    n, every = len(found.depth), join([found, drawn.fits])
+    by_spot = np.arange(len(every.depth)) >= n
+    touching = np.append(np.zeros(n, bool), drawn.doubtful)
+    for g in groups_of(every, optics):
+        touching[g] |= len(g) > 1
+    none = np.zeros(len(every.depth), bool)
+    edged = np.append(edged, np.zeros(len(drawn.doubtful), bool))
+    return Balls(every, touching, edged, none, by_spot, np.concatenate([np.zeros((n, 2, 2)), drawn.by_spot]), drawn.spot)
 
 
 def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:

@@ -10,6 +10,7 @@ estimator, held over the free places, shows what errors are left.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.decide import EDGE
 from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.find import CHANCE
-from rsa_vision.detect.balls.fits import BallFits, slopes, uneven_white
+from rsa_vision.detect.balls.fits import BallFits, uneven_white
+from rsa_vision.detect.balls.focal_spot import shapes_of
 from rsa_vision.detect.balls.quanta import ENOUGH, left_and_expected, shared_more
 from rsa_vision.detect.balls.random_effects import Common, Solution, Windows, hold, solve, variance_of
 from rsa_vision.detect.balls.surroundings import Modes, Places, around_each, mean_beside, modes, texture
@@ -27,7 +29,8 @@ from rsa_vision.detect.balls.usual import proportion, size_unlike, usual_size
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.shoulder import Curve, curve_of, shown, unseen_slope
-from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.marks.resolve import Balls
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import Beside
 from rsa_vision.detect.neighbours.edges import OF_SHIFT
 from rsa_vision.detect.neighbours.foreign import foreign, in_line, robust_residual
@@ -52,11 +55,10 @@ _LEAST_CHANCE = 0.2  # of the variance by weights alone
 
 def settle(
     film: NDArray[Any],
-    balls: BallFits,
+    found: Balls,
     places: list[Places],
     under: float,
     free: Bool,
-    edged: Bool,
     beside: Beside,
     optics: Optics,
     noise: NoiseModel,
@@ -66,15 +68,14 @@ def settle(
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
-    balls : BallFits
+    found : Balls
+        Those that were fitted together with an edge stay as they are if bending surfaces leave more of it.
     places : list of Places
         Around them.
     under : float
         Variance of the noise under balls, in units of that beside them.
     free : ndarray of bool, shape (n,)
         Not fitted together with a neighbour: those stay as they are.
-    edged : ndarray of bool, shape (n,)
-        Fitted together with an edge: those stay if bending surfaces leave more of it.
     beside : callable
     optics : Optics
     noise : NoiseModel
@@ -90,14 +91,15 @@ def settle(
     covered : ndarray of bool, shape (n,)
         Something else lies on nearly all of it.
     """
+    balls, edged, drawn = found.fits, found.edged, found.drawn
     if len(balls.depth) == 0:
         return balls, np.ones(0), np.zeros(0), np.zeros(0, bool)
     around = texture(places, len(free), noise)
     structure = np.where(free[:, None], around.structure, 0.0)
-    alone, level = free & ~edged & (balls.chi2_ring < EDGE), mean_beside(places, len(free))
+    alone, level = free & ~edged & ~drawn & (balls.chi2_ring < EDGE), mean_beside(places, len(free))
     told = alone & np.isfinite(level)
     clear = balls.rows(alone & (balls.chi2_ring < STRUCTURE))
-    common = Common(
+    alike = Common(
         optics,
         noise,
         under,
@@ -105,18 +107,19 @@ def settle(
         proportion(balls.depth[told], balls.background[told], level[told]),
         around.differ,
     )
-    curve = curve_of(film)
-    usual = float(np.median(balls.chi2_uneven[free])) if free.any() else 1.0  # what all balls leave is no speck on one
+    by_spot = replace(alike, size=usual_size(balls.rows(free & drawn & (balls.chi2_ring < STRUCTURE))), spot=found.spot)
+    curve, single = curve_of(film), free & ~drawn
+    usual = float(np.median(balls.chi2_uneven[single])) if single.any() else 1.0  # what all balls leave is no speck on one
     out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
     left, fitted = list[tuple[Float, Float]](), list[tuple[Int, Float, Float, int]]()
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
-        for begin in range(0, len(these.balls), _BATCH):
-            part = these.balls[begin : begin + _BATCH]
+        for batch, common in _batches(drawn[these.balls], alike, by_spot):
+            part = these.balls[batch]
             windows = _without_others(_windows(film, balls, part, these.half, beside, noise), edged[part], common)
             solution = solve(windows, known, structure[part], common)
             excess = np.maximum(under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
-            specks = find_specks(solution, solution.radius_px + optics.sigma_px, windows.fits.depth, excess, 2 * these.half + 1, noise)
+            specks = find_specks(solution, solution.radius_px + common.rim_px, windows.fits.depth, excess, 2 * these.half + 1, noise)
             fits = _fits(windows, solution, specks, known, common)
             better = (balls.chi2_uneven[part] - fits.chi2_uneven) / noise.scatter(fits.n_core)
             covered[part] = windows.covered
@@ -135,26 +138,34 @@ def settle(
             out = _put(out, part, fits, moved)
             described = (fits.chi2_ring < _UNEVEN) & (fits.chi2_core < _DESCRIBED)
             clear_ones = np.flatnonzero(moved & described & (fits.valid_fraction > _WHOLE))
-            if len(clear_ones) and sum(len(of) for of, _ in left) < ENOUGH:
+            if common.spot is None and len(clear_ones) and sum(len(of) for of, _ in left) < ENOUGH:
                 left.append(left_and_expected(solution, clear_ones, fits.background[clear_ones], known, these.half, common))
             if moved.any():
                 fitted.append((part[moved], solution.estimator[moved], solution.weight[moved], 2 * these.half + 1))
             both[~crossed] = 0.0
             stay = free[part] & ~moved
             out.covariance[part[stay], :2, :2] += (both + hidden)[stay]
-            mine = (these.near >= begin) & (these.near < begin + _BATCH)
-            by_background = solution.estimator * solution.shade
-            errors[mine, 0] = _held_over(these.values[mine], these.near[mine] - begin, by_background, known, structure[part], noise)
+            mine = np.isin(these.near, batch)
+            by_background, near = solution.estimator * solution.shade, np.searchsorted(batch, these.near[mine])
+            errors[mine, 0] = _held_over(these.values[mine], near, by_background, known, structure[part], noise)
         ratios.append(errors)
     more = shared_more(left)
     if more > 1:
         others = np.setdiff1d(np.arange(len(free)), np.concatenate([part for part, *_ in fitted]))
         out.covariance[others] *= more
         for part, estimator, weight, side in fitted:
-            out.covariance[part, :2, :2] += (more - 1) * _of_noise(estimator, weight, side, common)
+            out.covariance[part, :2, :2] += (more - 1) * _of_noise(estimator, weight, side, alike)
+    out.covariance[free, :2, :2] += found.by_spot[free]
     by_size = np.zeros(len(free))
     by_size[edged] = size_unlike(balls.rows(edged), clear)
     return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], by_size, covered > MOST_COVERED
+
+
+def _batches(drawn: Bool, alike: Common, by_spot: Common) -> Iterator[tuple[Int, Common]]:
+    """Yield balls, by their indices, that are fitted at once, and what these share: those drawn by the film's spot by themselves."""
+    for index, common in ((np.flatnonzero(~drawn), alike), (np.flatnonzero(drawn), by_spot)):
+        for begin in range(0, len(index), _BATCH):
+            yield index[begin : begin + _BATCH], common
 
 
 def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: Beside, noise: NoiseModel) -> Windows:
@@ -179,13 +190,13 @@ def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: 
 
 def _without_others(windows: Windows, edged: Bool, common: Common) -> Windows:
     """Mask the pixels of wires, dust and scratches, under the balls as well."""
-    half, noise, sigma_px = windows.half, common.noise, common.optics.sigma_px
+    half, noise = windows.half, common.noise
     some = np.flatnonzero((windows.fits.chi2_ring > _UNEVEN) | edged)
     fits, before = windows.fits.rows(some), windows.valid[some]
     rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
-    local, rim, depth = fits.position_px - windows.corner_px[some], fits.radius_px + sigma_px, fits.depth[:, None]
-    table = ball_table(round(common.optics.mu_px * sigma_px, 3))
-    value, *by = (shape.astype(np.float64) for shape in slopes(table, cols - local[:, :1], rows - local[:, 1:], fits.radius_px, sigma_px))
+    local, rim, depth = fits.position_px - windows.corner_px[some], fits.radius_px + common.rim_px, fits.depth[:, None]
+    shapes = shapes_of(common.optics, common.spot, cols - local[:, :1], rows - local[:, 1:], fits.radius_px)
+    value, *by = (shape.astype(np.float64) for shape in shapes)
     surface = np.broadcast_to(polynomial(half, cols - half, rows - half).T, (len(some), 6, len(cols)))
     images = np.concatenate([np.stack([*(depth * slope for slope in by), value], axis=1), surface], axis=1)
     target, held = hold(fits, common)
@@ -223,7 +234,7 @@ def _fits(windows: Windows, found: Solution, specks: Specks, known: Modes, commo
     rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1)
     local, residual = found.local_px + specks.shift_px, found.residual - specks.image
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
-    core = distance < (found.radius_px + common.optics.sigma_px)[:, None]
+    core = distance < (found.radius_px + common.rim_px)[:, None]
     under, ring = (uneven_white(residual, found.weight, local, side, where, common.noise) for where in (core, ~core))
     left = (found.weight * residual**2 * core).sum(axis=1) / np.maximum((core & (found.weight > 0)).sum(axis=1), 1)
     left = np.minimum(left, fits.chi2_core)  # a fit that is the best in correlated noise leaves more of slow changes

@@ -15,12 +15,13 @@ from rsa_vision.detect.models.profiles import TAIL, Optics
 from rsa_vision.types import Float
 
 Key = tuple[float, float, float, Optics]  # of a table: half width, length, taper
+Single = NDArray[np.float32]  # a millionth of the opacity: derivatives by differences stand it
 CELL, CELL_OF_BLUR = 0.3, 0.2  # pixels between the nodes of a needle table, and part of the blur where that is more
 GRID, FINE_Q = 1.1, 0.06  # ratio of the half widths and lengths, and steps of the slant, that have tables of their own
 SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of attenuation and blur, and by the taper
 LOG_GRID = math.log(GRID)
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
-_KERNEL, _UNBLURRED = 4.5, np.ones(1)  # standard deviations to which a kernel goes; one of none
+_KERNEL, _UNBLURRED = 4.5, np.ones(1, np.float32)  # standard deviations to which a kernel goes; one of none
 _PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
 
@@ -35,7 +36,7 @@ def _opacity(
     longer: float = 1.0,
     blurrier: float = 1.0,
     skew: float = 0.0,
-) -> Float:
+) -> Single:
     """Blurred opacity of a needle so many times wider and longer, on the grid for one of this half width and length stretched with it.
 
     A ray in depth ``z`` of the needle crosses it at the distance ``s + sqrt(slant) z`` from the tip; of its chord only the part before the
@@ -49,6 +50,7 @@ def _opacity(
     along, oblique = optics.uneven
     mirrored = not (skew or oblique)  # one half is enough
     p = cell_p * np.arange(n_p // 2 + 1) if mirrored else first[1] * wider + cell_p * np.arange(n_p)
+    s, p = s.astype(np.float32), p.astype(np.float32)
     half_width, length = half_width * wider, length * longer
     # where the needle is, with what rays that cross its end aslant see of it; only blur comes to the other nodes
     far = length + (math.sqrt(slant) + abs(skew)) * half_width
@@ -63,7 +65,7 @@ def _opacity(
     if slant:
         chord *= np.clip(0.5 + before / (np.sqrt(slant) * np.maximum(chord, 1e-9)), 0.0, 1.0)
     fine = -np.expm1(-optics.mu_px * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
-    opacity = np.zeros((n_s, len(p)))
+    opacity = np.zeros((n_s, len(p)), np.float32)
     opacity[rows, cols] = (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2]) / 4
 
     lights = []  # part of the light, and the variances and covariance of its blur in cells
@@ -73,26 +75,27 @@ def _opacity(
             lights.append((part, var_s, var_p, oblique * sigma**2 / (cell_s * cell_p)))
     seen = _obliquely_blurred(opacity, lights) if oblique else _blurred(opacity, lights, mirrored=mirrored)
     if any(optics.curve):
-        seen = film_curve(seen, optics.curve)
+        seen = film_curve(seen, optics.curve).astype(np.float32)
     return np.concatenate([seen[:, :0:-1], seen], axis=1) if mirrored else seen
 
 
-def _kernel(variance: float) -> Float:
+@lru_cache(maxsize=1024)
+def _kernel(variance: float) -> Single:
     sigma = math.sqrt(variance)
-    return np.asarray(cv2.getGaussianKernel(2 * int(_KERNEL * sigma + 0.5) + 1, sigma), np.float64)
+    return np.asarray(cv2.getGaussianKernel(2 * int(_KERNEL * sigma + 0.5) + 1, sigma, cv2.CV_32F), np.float32)
 
 
-def _blurred(image: Float, lights: list[tuple[float, float, float, float]], *, mirrored: bool) -> Float:
+def _blurred(image: Single, lights: list[tuple[float, float, float, float]], *, mirrored: bool) -> Single:
     """Blur lengthwise and across; ``mirrored``: what lies before the first column is as what lies behind it."""
     border = cv2.BORDER_REFLECT_101 if mirrored else cv2.BORDER_CONSTANT
     out = np.zeros_like(image)
     for part, var_s, var_p, _ in lights:
-        lengthwise = cv2.sepFilter2D(image, -1, _UNBLURRED, part * _kernel(var_s), borderType=cv2.BORDER_CONSTANT)
-        out += cv2.sepFilter2D(lengthwise, -1, _kernel(var_p), _UNBLURRED, borderType=border)
+        lengthwise = cv2.sepFilter2D(image, -1, _UNBLURRED, _kernel(var_s), borderType=cv2.BORDER_CONSTANT)
+        out += part * cv2.sepFilter2D(lengthwise, -1, _kernel(var_p), _UNBLURRED, borderType=border)
     return out
 
 
-def _obliquely_blurred(image: Float, lights: list[tuple[float, float, float, float]]) -> Float:
+def _obliquely_blurred(image: Single, lights: list[tuple[float, float, float, float]]) -> Single:
     """Blur by Gaussians with covariances; what leaves one end comes in at the other, beyond which it has faded."""
     (rows, cols), widest = image.shape, lights[-1]
     beyond_s, beyond_p = (int(_KERNEL / 2 * math.sqrt(variance)) for variance in widest[1:3])
@@ -100,23 +103,23 @@ def _obliquely_blurred(image: Float, lights: list[tuple[float, float, float, flo
     at_s, at_p = 2 * np.pi * np.fft.fftfreq(padded[0])[:, None], 2 * np.pi * np.fft.rfftfreq(padded[1])
     square_s, both, square_p = at_s**2, at_s * at_p, at_p**2
     passed = sum(part * np.exp(-0.5 * (var_s * square_s + var_p * square_p) - by_both * both) for part, var_s, var_p, by_both in lights)
-    return np.asarray(irfft2(rfft2(image, s=padded) * passed, s=padded)[:rows, :cols], np.float64)
+    return np.asarray(irfft2(rfft2(image, s=padded) * passed, s=padded)[:rows, :cols], np.float32)
 
 
-def film_curve(opacity: Float, curve: tuple[float, float]) -> Float:
+def film_curve(opacity: Float | Single, curve: tuple[float, float]) -> Float:
     """What film shows of blurred opacities, by the two coefficients of :attr:`Optics.curve`."""
     shifted = _shifted(opacity, curve[0])
     return np.asarray(shifted + curve[1] * shifted * (1 - shifted) * (1 - 2 * shifted), np.float64)
 
 
-def by_film_curve(opacity: Float, curve: tuple[float, float]) -> list[Float]:
+def by_film_curve(opacity: Float | Single, curve: tuple[float, float]) -> list[Float]:
     """Derivatives of what film shows by the two coefficients of its curve."""
     shifted = _shifted(opacity, curve[0])
     bow = shifted * (1 - shifted)
     return [bow * (1 + curve[1] * (1 - 6 * bow)), bow * (1 - 2 * shifted)]
 
 
-def _shifted(opacity: Float, by: float) -> Float:
+def _shifted(opacity: Float | Single, by: float) -> Float:
     """Opacities whose log odds are by so much more."""
     return np.asarray(opacity / (opacity + math.exp(-by) * (1 - opacity)), np.float64)
 
@@ -147,7 +150,7 @@ def table_for(
 
 
 @lru_cache(maxsize=256)
-def table(half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str) -> NDArray[np.float32]:
+def table(half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str) -> Single:
     """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
     ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur, by
@@ -181,14 +184,14 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
     return values
 
 
-def look_up(values: NDArray[np.float32], at_s: Float, at_p: Float) -> Float:
+def look_up(values: Single, at_s: Float, at_p: Float) -> Float:
     """Interpolate all columns of a table bilinearly at these places in units of its cells, within it; single precision is far finer."""
     n_p = values.shape[2]
     low_s, low_p = at_s.astype(np.intp), at_p.astype(np.intp)
     part_s, part_p = (at_s - low_s).astype(np.float32), (at_p - low_p).astype(np.float32)
     node = low_s * n_p + low_p
     nodes = values.reshape(len(values), -1)
-    near: NDArray[np.float32] = nodes.take(node, axis=1, mode="wrap")
+    near: Single = nodes.take(node, axis=1, mode="wrap")
     beside, far, across = (nodes.take(node + step, axis=1, mode="wrap") for step in (1, n_p, n_p + 1))  # within: spares the check
     for low, high in ((near, beside), (far, across)):
         high -= low

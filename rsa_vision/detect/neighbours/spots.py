@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import LEAST_KNOWN, over_clutter
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, look_clear, over_clutter
 from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, SURE, misfit, plausible
-from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits, half_size, slopes, uneven, uneven_white
+from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits, half_size, join, slopes, uneven, uneven_white
+from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.profiles import Optics, ball_table
@@ -41,18 +42,24 @@ _BETTER = 0.5  # of what they left: less than that they leave with the spot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spot:
-    """Focal spot, as spread over marks of one height.
+class Drawn:
+    """Balls that the film's focal spot explains.
 
     Attributes
     ----------
-    points : ndarray of shape (4, 2)
-        (col, row) from the centroid, px.
-    weights : ndarray of shape (4,)
+    fits : BallFits
+        None of them where fewer than :data:`COMPANY` are explained.
+    spot : Spot or None
+    doubtful : ndarray of bool, shape (n,)
+        Two balls of the film's own explain these nearly as well: their covariances hold both.
+    by_spot : ndarray of shape (n, 2, 2)
+        What of the covariances of the centres is of that, and of what is not known of the spot, px^2.
     """
 
-    points: Float
-    weights: Float
+    fits: BallFits
+    spot: Spot | None
+    doubtful: Bool
+    by_spot: Float
 
 
 def spot_of(along: Float) -> Spot:
@@ -70,13 +77,6 @@ def spot_of(along: Float) -> Spot:
     return Spot(points, (1 + sides * uneven_) / 4)
 
 
-def spot_image(spot: Spot, dx: Float, dy: Float, radius: Float, optics: Optics) -> Float:
-    """Return images of balls of depth one, shape (n, p), at these pixels from their centres."""
-    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
-    parts = [w * slopes(table, dx - p[0], dy - p[1], radius, optics.sigma_px)[0] for p, w in zip(spot.points, spot.weights, strict=True)]
-    return np.asarray(sum(parts))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
     along: Float  # (4,)
@@ -85,9 +85,7 @@ class _State:
     linear: Float  # (n, 7): depth and background
 
 
-def find_spot(
-    film: NDArray[Any], odd: BallFits, sure: BallFits, optics: Optics, noise: NoiseModel, others: Any
-) -> tuple[BallFits, Spot | None, Bool]:
+def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics, noise: NoiseModel, others: Any) -> Drawn:
     """Find the spot that explains odd images, and fit the balls that it explains.
 
     Parameters
@@ -95,8 +93,8 @@ def find_spot(
     film : ndarray of shape (rows, cols)
     odd : BallFits
         Single fits that leave more than a ball should.
-    sure : BallFits
-        Clear balls.
+    clean : BallFits
+        Those that do not: a spot may have drawn some of them as well.
     optics : Optics
     noise : NoiseModel
     others : callable, optional
@@ -104,13 +102,10 @@ def find_spot(
 
     Returns
     -------
-    fits : BallFits
-        None of them where fewer than :data:`COMPANY` are explained.
-    spot : Spot or None
-    doubtful : ndarray of bool, shape (n,)
-        Two balls of the film's own explain these nearly as well: their covariances hold both.
+    Drawn
     """
-    none, nobody = odd.rows(slice(0)), np.zeros(0, bool)
+    sure = clean.rows(look_clear(clean, noise))
+    nobody = Drawn(odd.rows(slice(0)), None, np.zeros(0, bool), np.zeros((0, 2, 2)))
     worth = (
         (odd.explained > _EXPLAINED)
         & (over_clutter(odd) > SURE)
@@ -121,13 +116,13 @@ def find_spot(
     odd = odd.rows(worth)
     # tantalum, not bone, and those with most company of their size
     if len(odd.depth) < COMPANY:
-        return none, None, nobody
+        return nobody
     depth = np.abs(odd.depth)
     usual = np.median(np.abs(sure.depth)) if len(sure.depth) >= LEAST_KNOWN else np.sort(depth)[-COMPANY]
     odd = odd.rows(depth > _FAINT * usual)
     like = np.abs(np.log(odd.radius_px[:, None] / odd.radius_px)) < np.log(_LIKE)
     if like.sum(axis=1).max(initial=0) < COMPANY:
-        return none, None, nobody
+        return nobody
     odd = odd.rows(like[like.sum(axis=1).argmax()])
     odd = odd.rows(np.argsort(-over_clutter(odd)))
     radius = float(np.median(odd.radius_px))
@@ -141,28 +136,44 @@ def find_spot(
     window = _window(film, odd, half, others, noise)
     state, _ = _fitted(window, _start(odd, window, best.along), _LAST_STEPS, optics, noise, radius)
     if abs(state.along[2]) < _ACROSS * np.hypot(*state.along[:2]):
-        return none, None, nobody
-    fits = _table(window, state, odd, optics, noise)
+        return nobody
+    fits, _ = _table(window, state, odd, optics, noise)
     rest, before = misfit(fits, noise), misfit(odd, noise)
     alike = np.abs(np.log(fits.radius_px / np.median(fits.radius_px))) < np.log(_LIKE)  # others are at another height
     kept = alike & plausible(fits, noise) & (rest < np.maximum(DOUBTFUL * MISFIT, _BETTER * before))
     if np.count_nonzero(kept & (rest < _BETTER * before)) < COMPANY:
-        return none, None, nobody
-    spot, better = spot_of(state.along), (rest < _BETTER * before)[kept]
-    fits, odd = fits.rows(kept), odd.rows(kept)
+        return nobody
+    more = _drawn_as_well(film, clean, state, kept, half, optics, noise, others)
+    better = np.append((rest < _BETTER * before)[kept], np.zeros(np.count_nonzero(more), bool))
+    odd, sure = join([odd.rows(kept), clean.rows(more)]), clean.rows(~more & look_clear(clean, noise))
+    window = _window(film, odd, half, others, noise)
+    state, _ = _fitted(window, _start(odd, window, state.along), _LAST_STEPS, optics, noise, radius)
+    fits, by_spot = _table(window, state, odd, optics, noise)
+    spot = spot_of(state.along)
 
     def image(i: int, cols: Float, rows: Float) -> Float:
         dx, dy = (axis[None] - middle for axis, middle in zip((cols, rows), fits.position_px[i], strict=True))
-        return np.asarray(spot_image(spot, dx, dy, fits.radius_px[[i]], optics)[0])
+        return np.asarray(shapes_of(optics, spot, dx, dy, fits.radius_px[[i]])[0][0])
 
     gain, apart = gain_over_two(film, fits, image, odd, sure, optics, noise, others)
     if np.count_nonzero(better & (gain > LEAST_GAIN)) < COMPANY:
-        return none, None, nobody
-    doubtful = gain < LEAST_GAIN
+        return nobody
+    doubtful, may_be = gain < LEAST_GAIN, gain > -LEAST_GAIN
+    either = np.where(doubtful[:, None, None], apart[:, :, None] * apart[:, None], 0.0)
     covariance = fits.covariance.copy()
-    covariance[doubtful, :2, :2] += apart[doubtful, :, None] * apart[doubtful, None]
-    may_be = gain > -LEAST_GAIN
-    return replace(fits, covariance=covariance).rows(may_be), spot, doubtful[may_be]
+    covariance[:, :2, :2] += either
+    return Drawn(replace(fits, covariance=covariance).rows(may_be), spot, doubtful[may_be], (by_spot + either)[may_be])
+
+
+def _drawn_as_well(
+    film: NDArray[Any], clean: BallFits, spot: _State, kept: Bool, half: int, optics: Optics, noise: NoiseModel, others: Any
+) -> Bool:
+    """Say which of these the spot explains better than a Gaussian does, as balls of the size of those that told it."""
+    usual = float(np.median(spot.radius[kept]))
+    window = _window(film, clean, half, others, noise)
+    drawn, plain = (_at_rest(window, clean, along, optics, noise) for along in (spot.along, np.zeros(4)))
+    alike = np.abs(np.log(drawn[0].radius / usual)) < np.log(_LIKE)
+    return np.asarray(alike & (drawn[1] < plain[1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,12 +243,23 @@ def _equations(w: _Window, s: _State, optics: Optics, noise: NoiseModel) -> _Equ
     return _Equations(by[0], np.concatenate([place, weighted], axis=1), shared * of_ball, root, residual, theta)
 
 
+def _at_rest(w: _Window, balls: BallFits, along: Float, optics: Optics, noise: NoiseModel) -> tuple[_State, Float]:
+    """Fit balls drawn by a known spot; with what they leave of a pixel."""
+    s, left = _start(balls, w, along), np.ones(len(balls.depth))
+    for _ in range(_LAST_STEPS):
+        e = _equations(w, s, optics, noise)
+        left = _left(w, e)
+        s = _moved(s, e, along, _by_own(e, invert(np.matmul(e.own, e.own.transpose(0, 2, 1)))))
+    return s, left
+
+
 def _fitted(w: _Window, s: _State, steps: int, optics: Optics, noise: NoiseModel, radius: float) -> tuple[_State, Float]:
+    """Fit balls and the spot that draws them; with what they leave of a pixel."""
     left = np.ones(len(s.radius))
     for _ in range(steps):
         e = _equations(w, s, optics, noise)
         own, shared, residual = e.own, e.shared, e.residual
-        left = np.square(residual).sum(axis=1) / np.maximum(w.valid.sum(axis=1), 1)
+        left = _left(w, e)
         say = 1 / np.maximum(left, 1.0)
         inverse = invert(np.matmul(own, own.transpose(0, 2, 1)))
         of_own = np.matmul(inverse, np.matmul(own, shared.transpose(0, 2, 1)))
@@ -247,16 +269,29 @@ def _fitted(w: _Window, s: _State, steps: int, optics: Optics, noise: NoiseModel
         normal += 1e-3 * np.diag(np.diag(normal)) + 1e-9 * np.eye(4)
         change = np.linalg.solve(normal, right)
         change *= min(1.0, _MOST_STEP_PX / max(float(np.abs(change).max()), 1e-9))
-        by_own = np.matmul(inverse, np.matmul(own, residual[:, :, None]))[:, :, 0] - of_own @ change
-        by_own *= np.minimum(1.0, _MOST_STEP_PX / np.maximum(np.abs(by_own[:, :3]).max(axis=1), 1e-9))[:, None]
         along = s.along + change
         along[3] = np.clip(along[3], -0.9, 0.9)
         along[:3] *= min(1.0, _REACH * radius / float(np.hypot(np.hypot(*along[:2]), along[2])))
-        s = _State(along, s.local + by_own[:, :2], np.clip(s.radius + by_own[:, 2], *RADIUS_PX), e.linear)
+        s = _moved(s, e, along, _by_own(e, inverse) - of_own @ change)
     return s, left
 
 
-def _table(w: _Window, s: _State, odd: BallFits, optics: Optics, noise: NoiseModel) -> BallFits:
+def _left(w: _Window, e: _Equations) -> Float:
+    return np.asarray(np.square(e.residual).sum(axis=1) / np.maximum(w.valid.sum(axis=1), 1))
+
+
+def _by_own(e: _Equations, inverse: Float) -> Float:
+    """Changes (n, 10) of what is each ball's own, the spot staying as it is."""
+    return np.asarray(np.matmul(inverse, np.matmul(e.own, e.residual[:, :, None]))[:, :, 0])
+
+
+def _moved(s: _State, e: _Equations, along: Float, by_own: Float) -> _State:
+    by_own = by_own * np.minimum(1.0, _MOST_STEP_PX / np.maximum(np.abs(by_own[:, :3]).max(axis=1), 1e-9))[:, None]
+    return _State(along, s.local + by_own[:, :2], np.clip(s.radius + by_own[:, 2], *RADIUS_PX), e.linear)
+
+
+def _table(w: _Window, s: _State, odd: BallFits, optics: Optics, noise: NoiseModel) -> tuple[BallFits, Float]:
+    """Return the fits, and what of the covariances of their centres is of what is not known of the spot."""
     e = _equations(w, s, optics, noise)
     weighted, shared, root, residual = e.own, e.shared, e.root, e.residual
     n, side, depth = len(e.value), 2 * w.half + 1, e.linear[:, 0]
@@ -268,21 +303,21 @@ def _table(w: _Window, s: _State, odd: BallFits, optics: Optics, noise: NoiseMod
     moved = np.matmul(estimator, shared.transpose(0, 2, 1))
     rest = shared - np.matmul(moved.transpose(0, 2, 1), weighted)
     unknown = invert(np.einsum("nip,njp->ij", rest, rest)[None])[0] * noise.correlation.sum()
-    covariance = scatter[:, :4, :4] + np.einsum("nai,ij,nbj->nab", moved[:, :4], unknown, moved[:, :4])
+    by_spot = np.einsum("nai,ij,nbj->nab", moved[:, :4], unknown, moved[:, :4])
     distance = np.hypot(w.cols - s.local[:, :1], w.rows - s.local[:, 1:])
-    core: Bool = distance < (s.radius + optics.sigma_px)[:, None] + float(np.hypot(*spot_of(s.along).points.T).max())
+    core: Bool = distance < (s.radius + optics.sigma_px)[:, None] + spot_of(s.along).reach_px
     square, weight = residual**2, root**2
     seen = (core * w.valid).sum(axis=1)
     counted = np.maximum(seen, 1.0)
     bare = np.where(root > 0, residual / np.where(root > 0, root, 1.0), 0.0)
     raised = weight * (bare + depth[:, None] * e.value) ** 2
     ring, under = uneven(bare, weight, s.local, side, ~core), uneven_white(bare, weight, s.local, side, core, noise)
-    return replace(
+    fits = replace(
         odd,
         position_px=s.local + w.corner,
         radius_px=s.radius,
         depth=depth,
-        covariance=covariance,
+        covariance=scatter[:, :4, :4] + by_spot,
         chi2_core=(square * core).sum(axis=1) / counted,
         chi2_ring=ring,
         chi2_uneven=under,
@@ -295,11 +330,14 @@ def _table(w: _Window, s: _State, odd: BallFits, optics: Optics, noise: NoiseMod
         n_core=counted,
         converged=np.ones(n, bool),
     )
+    return fits, by_spot[:, :2, :2]
 
 
-def with_spot(others: Any, balls: BallFits, spot: Spot, optics: Optics) -> Any:
+def with_spot(others: Any, balls: BallFits, spot: Spot | None, optics: Optics) -> Any:
     """Return what makes the images of these balls beside those of ``others``, at pixels (cols, rows)."""
-    reach = balls.radius_px + 4 * optics.sigma_px + float(np.hypot(*spot.points.T).max())
+    if spot is None:
+        return others
+    reach = balls.radius_px + 4 * optics.sigma_px + spot.reach_px
 
     def images(cols: Float, rows: Float) -> Float:
         total = np.zeros(cols.shape) if others is None else others(cols, rows)
@@ -307,7 +345,7 @@ def with_spot(others: Any, balls: BallFits, spot: Spot, optics: Optics) -> Any:
         at = balls.position_px
         for k in np.flatnonzero(((at > low - reach[:, None]) & (at < high + reach[:, None])).all(axis=1)):
             dx, dy = (axis.reshape(1, -1) - middle for axis, middle in zip((cols, rows), at[k], strict=True))
-            total = total + balls.depth[k] * spot_image(spot, dx, dy, balls.radius_px[[k]], optics).reshape(cols.shape)
+            total = total + balls.depth[k] * shapes_of(optics, spot, dx, dy, balls.radius_px[[k]])[0].reshape(cols.shape)
         return np.asarray(total)
 
     return images
