@@ -168,7 +168,7 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
         return _failed(table, differing)
     cage = cage.at_temperature(study.temperature_c)
     marks = [_identify(film, study, cage) for film in table.films[: n_cage_films or None]]
-    findings = [(code, f"{film.path.name}: {_explain(code, m)}") for film, m in zip(table.films, marks, strict=False) for code in m.reasons]
+    findings = [(code, _explain(code, m, film)) for film, m in zip(table.films, marks, strict=False) for code in m.reasons]
     if not all(marks):
         return _failed(table, findings)
     named, free, foreign = name_marks(table, marks, n_cage_films)
@@ -287,12 +287,13 @@ def _identify(film: FilmReading, study: Study, cage: Cage) -> CageIdentification
     )
 
 
-def _explain(code: str, found: CageIdentification) -> str:
+def _explain(code: str, found: CageIdentification, film: FilmReading) -> str:
+    why = code.replace("-", " ")
     if code == "cage-not-found":
-        return f"the cage was not found: {found.runner_up or 'too few of its marks'}"
+        why = f"the cage was not found among {len(film.images)} marker images: {found.runner_up or 'too few of its marks'}"
     if code == "cage-ambiguous":
-        return f"posterior of the names {found.posterior:.4f}; the rival: {found.runner_up or 'images at random'}"
-    return code.replace("-", " ")
+        why = f"posterior of the names {found.posterior:.4f}; the rival: {found.runner_up or 'images at random'}"
+    return f"{film.path.name}: {why}"
 
 
 def _stretch(film: FilmReading, found: CageIdentification) -> list[Finding]:

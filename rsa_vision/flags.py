@@ -63,7 +63,7 @@ REASONS: Final[dict[str, str]] = {
     "film-name": "the file name does not say subject and examination; rename it SUBJECT_EXAM[_fK].EXT or set file_pattern in study.toml",
     "film-duplicate": "the same file is given twice; look which of the examinations the film belongs to",
     "no-markers": "no marker image was found on a film; look at the film, its polarity and response",
-    "cage-not-found": "the marks of the cage are not on the film; look whether it is this cage and this orientation",
+    "cage-not-found": "the marks of the cage are not on the film; is it this cage, this orientation, and a film as the detector gave it?",
     "cage-film-differs": "the film with _cage has other pixels than the film without; export both whole, at one pixel pitch",
     "cage-ambiguous": "two ways of naming the cage marks explain the film nearly as well; set orientation, or look at the overlay",
     "film-stretched": "the film is stretched against its pixel pitch: another build of the cage, or a wrong pixel pitch",
