@@ -123,6 +123,15 @@ def are_of_a_kind(pins: list[NeedleFit]) -> bool:
     return bool(pins) and _count_alike(pins, _ALIKE) >= max(LEAST_OF_A_KIND, _MOST * len(pins))
 
 
+def without_company(pins: list[NeedleFit]) -> list[bool]:
+    """Say of which pins there are too few of about their size to make a kind: those are what they are by themselves."""
+    if not pins:
+        return []
+    sizes = _log_sizes(pins)
+    alike = (np.abs(sizes[:, None] - sizes) < _ROUGHLY_ALIKE).all(axis=2)
+    return [bool(few) for few in alike.sum(axis=1) < LEAST_OF_A_KIND]
+
+
 def _count_alike(pins: list[NeedleFit], within: float) -> int:
     sizes = _log_sizes(pins)
     return int((np.abs(sizes - np.median(sizes, axis=0)) < within).all(axis=1).sum())

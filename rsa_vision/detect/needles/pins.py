@@ -16,18 +16,17 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
 from rsa_vision.detect.needles.first_pins import best_tapered, distinct, likest_pins
 from rsa_vision.detect.needles.fits import excess_of, fit_needles, significant_misfit
-from rsa_vision.detect.needles.of_a_kind import are_alike, are_of_a_kind, odd_lengths, others_like
+from rsa_vision.detect.needles.of_a_kind import are_alike, are_of_a_kind, odd_lengths, others_like, without_company
 from rsa_vision.detect.needles.optics import common_optics
 from rsa_vision.detect.needles.pointed import (
     EXPLAINED,
-    LEAST_OF_A_KIND,
     STANDS_OUT_ROUGHLY,
     SURER_THAN_ROD,
     is_pin,
     middle,
     pointed,
     points_one_way,
-    standing_out,
+    shows_its_form,
     turned,
     unexplained,
 )
@@ -122,7 +121,7 @@ def _found_from(
         pins, optics = fit_shared(film, pins, replace(start, proportion=_proportion(pins)), noise, parallel=False, alike=True)
     if not tees:  # beside those a pin may be what is seen of one, and says so
         pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
-        pins = pins if len(pins) >= LEAST_OF_A_KIND else standing_out(pins, noise)
+        pins = [f for f, alone in zip(pins, without_company(pins), strict=True) if not alone or shows_its_form(f, noise)]
     pins = [f for f in pins if points_one_way(film, f, others_beside(f, [o for o in pins if o is not f], optics), optics, noise)]
     pins = [f for f in _still(pins, noise) if np.sign(f.depth) == sign]  # a fit among others may end up as the gap between them
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0

@@ -70,7 +70,7 @@ def pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: No
     typical = float(np.median([f.shape.length_px for f in clear[:_SAMPLE]])) if clear else np.nan
     clear = [f for f in clear if _about_as_long(f, typical)]
     if len(clear) < LEAST_OF_A_KIND:
-        return standing_out(clear, noise)
+        return [f for f in clear if shows_its_form(f, noise)]
     kept = list(clear)
     for fit, enough in zip(pins, alone, strict=True):
         if not enough:
@@ -86,9 +86,9 @@ def _about_as_long(fit: NeedleFit, typical_px: float) -> bool:
     return 1 / _AS_LONG < fit.shape.length_px / typical_px < _AS_LONG
 
 
-def standing_out(pins: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
-    """Keep the pins whose form no noise hides: few have no company that tells what they are."""
-    return [f for f in pins if f.height > _ALONE * float(np.sqrt(noise.variance_at(np.array(f.background))))]
+def shows_its_form(pin: NeedleFit, noise: NoiseModel) -> bool:
+    """Say whether no noise hides the form of a pin: one without company has nothing else that tells what it is."""
+    return pin.height > _ALONE * float(np.sqrt(noise.variance_at(np.array(pin.background))))
 
 
 def points_one_way(film: NDArray[Any], fit: NeedleFit, others: Images | None, optics: Optics, noise: NoiseModel) -> bool:
