@@ -12,6 +12,7 @@ from rsa_vision.types import Float
 FINE = 3  # samples along a pixel
 LEAST = 0.02  # largest value below which the product is nothing
 _STEP_PX = 0.05
+_EITHER_WAY = _STEP_PX * np.concatenate([np.eye(3), -np.eye(3)])  # (col, row, radius)
 _ROOM_PX = 2 * _STEP_PX
 _BLURS = 4.0  # beyond which the blurred product has faded
 
@@ -34,6 +35,15 @@ def _blur_to_pixels(n: int, sigma_px: float) -> tuple[Float, Float]:
         return pixels
 
     return seen(blur), seen(np.asarray(np.gradient(blur, 1 / FINE, axis=0)))
+
+
+def _opacities(x: Float, y: Float, balls: Float, mu_px: float) -> Float:
+    """Opacities of balls, rows of (col, row, radius), on a grid, shape (n, rows, columns); single precision is far finer than the grid."""
+    col, row, radius = balls.T[:, :, None]
+    u, v = ((radius**2 - np.square(x - col)).astype(np.float32), np.square(y - row).astype(np.float32))
+    chord = np.sqrt(np.maximum(u[:, None] - v[:, :, None], 0))
+    opaque: Float = -np.expm1(-2 * mu_px * chord)
+    return opaque
 
 
 def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, size: int) -> tuple[Float, Float]:
@@ -76,17 +86,12 @@ def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, si
         for f, d in zip(fine, apart, strict=True)
     ]
     x, y = fine[0][both[0]], fine[1][both[1]]
-
-    def opacity(ball: int, dx: float = 0.0, dy: float = 0.0, larger: float = 0.0) -> Float:
-        u, v = (x, y) if ball == 0 else (x - apart[0], y - apart[1])
-        chord = 2 * np.sqrt(np.maximum((radius[ball] + larger) ** 2 - ((u - dx) ** 2)[None] - ((v - dy) ** 2)[:, None], 0.0))
-        opaque: Float = -np.expm1(-mu_px * chord)
-        return opaque
-
-    one, two = opacity(0), opacity(1)
+    at = np.stack([np.zeros(3), *_EITHER_WAY]) + np.append(apart, radius[1])
+    one, larger, smaller = _opacities(x, y, np.array([[0.0, 0.0, radius[0] + step] for step in (0.0, _STEP_PX, -_STEP_PX)]), mu_px)
+    two, *moved = _opacities(x, y, at, mu_px)
     # of the second ball's moves, and of either radius: blurring is linear, so differences are taken first
-    by_sharp = [one * (opacity(1, *step) - opacity(1, *-step)) for step in _STEP_PX * np.eye(3)]
-    by_sharp.append((opacity(0, larger=_STEP_PX) - opacity(0, larger=-_STEP_PX)) * two)
+    by_sharp = [one * (more - less) for more, less in zip(moved[:3], moved[3:], strict=True)]
+    by_sharp.append((larger - smaller) * two)
     across, down = ([m[:, part] for m in _blur_to_pixels(int(n), sigma_px)] for n, part in zip(lengths, both, strict=True))
     seen = down[0] @ (one * two) @ across[0].T
     by_row, by_col = down[1] @ (one * two) @ across[0].T, down[0] @ (one * two) @ across[1].T

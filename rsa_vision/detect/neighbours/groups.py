@@ -275,7 +275,7 @@ def images_in(
 ) -> GroupImages:
     """Draw balls at places (k, 2) in a window; ``ground``: what is under them and they take their part of."""
     dx, dy = window.cols - local[:, :1], window.rows - local[:, 1:]
-    rho = np.hypot(dx, dy)
+    rho = np.sqrt(dx * dx + dy * dy)
     value, slope, slope_r = ball_table(round(mu_px * sigma_px, 3)).evaluate(rho / sigma_px, radius / sigma_px)
     slope = slope / (sigma_px * np.maximum(rho, 1e-9))
     # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
