@@ -24,7 +24,7 @@ from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.detect.neighbours.lines import without_lines
 from rsa_vision.detect.neighbours.oblong import are_oblong
-from rsa_vision.detect.neighbours.spots import find_spot, with_spot
+from rsa_vision.detect.neighbours.spots import Drawn, find_spot, with_spot
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
 
@@ -177,14 +177,28 @@ def resolve_balls(
     found, edged = beside_edges(film, found, optics, noise, tees)
     balls = plausible(found, noise)
     found, edged = found.rows(balls), edged[balls]
-    n, every = len(found.depth), join([found, drawn.fits])
+    of_spot, at_edge = _drawn_beside_edges(film, drawn, optics, noise, needles)
+    n, every = len(found.depth), join([found, of_spot])
     by_spot = np.arange(len(every.depth)) >= n
     touching = np.append(np.zeros(n, bool), drawn.doubtful)
     for g in groups_of(every, optics):
         touching[g] |= len(g) > 1
     none = np.zeros(len(every.depth), bool)
-    edged = np.append(edged, np.zeros(len(drawn.doubtful), bool))
+    edged = np.append(edged, at_edge)
     return Balls(every, touching, edged, none, by_spot, np.concatenate([np.zeros((n, 2, 2)), drawn.by_spot]), drawn.spot)
+
+
+def _drawn_beside_edges(
+    film: NDArray[Any], drawn: Drawn, optics: Optics, noise: NoiseModel, needles: Painted | None
+) -> tuple[BallFits, Bool]:
+    """Fit again, as :func:`beside_edges`, those that surely are single balls drawn by the spot."""
+    parts, edged = [drawn.fits.rows(slice(0))], drawn.doubtful.copy()
+    for i, doubtful in enumerate(drawn.doubtful):
+        one, others = drawn.fits.rows([i]), with_spot(needles, drawn.fits.rows(np.arange(len(edged)) != i), drawn.spot, optics)
+        fits, at_edge = (one, [False]) if doubtful else beside_edges(film, one, optics, noise, others, drawn.spot)
+        parts.append(fits)
+        edged[i] = at_edge[0]
+    return join(parts), edged
 
 
 def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:

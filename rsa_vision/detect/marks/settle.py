@@ -107,7 +107,8 @@ def settle(
         proportion(balls.depth[told], balls.background[told], level[told]),
         around.differ,
     )
-    by_spot = replace(alike, size=usual_size(balls.rows(free & drawn & (balls.chi2_ring < STRUCTURE))), spot=found.spot)
+    clear_drawn = balls.rows(free & drawn & ~edged & (balls.chi2_ring < STRUCTURE))
+    by_spot = replace(alike, size=usual_size(clear_drawn), spot=found.spot)
     curve, single = curve_of(film), free & ~drawn
     usual = float(np.median(balls.chi2_uneven[single])) if single.any() else 1.0  # what all balls leave is no speck on one
     out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
@@ -155,9 +156,10 @@ def settle(
         out.covariance[others] *= more
         for part, estimator, weight, side in fitted:
             out.covariance[part, :2, :2] += (more - 1) * _of_noise(estimator, weight, side, alike)
-    out.covariance[free, :2, :2] += found.by_spot[free]
+    out.covariance[:, :2, :2] += found.by_spot
     by_size = np.zeros(len(free))
-    by_size[edged] = size_unlike(balls.rows(edged), clear)
+    for kind, usual_ones in ((edged & ~drawn, clear), (edged & drawn, clear_drawn)):
+        by_size[kind] = size_unlike(balls.rows(kind), usual_ones)
     return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], by_size, covered > MOST_COVERED
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.decide import hopeless, of_size
 from rsa_vision.detect.balls.find import plausible
 from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits, join
+from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, all_but, groups_of
@@ -27,7 +29,9 @@ _CLEAR = 50.0  # significance of balls of which blur is seen so well
 _MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: each makes what else is fitted less sure
 
 
-def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> tuple[BallFits, Bool]:
+def beside_edges(
+    film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None, spot: Spot | None = None
+) -> tuple[BallFits, Bool]:
     """Fit again, with an edge in the background, the balls that lie on or beside one (the likelihood tells); say which they are.
 
     An edge that a quadratic surface cannot follow pulls the centre. What the edge model moves it by says how much is at stake: a quarter of
@@ -42,6 +46,8 @@ def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
     noise : NoiseModel
     tees : callable, optional
         Images to be taken away first.
+    spot : Spot, optional
+        That draws the balls, if it is no Gaussian.
 
     Returns
     -------
@@ -61,23 +67,23 @@ def beside_edges(film: NDArray[Any], fits: BallFits, optics: Optics, noise: Nois
         if len(g) > MOST_IN_GROUP or not worth[index].any() or (plain.radius_px >= RADIUS_PX[1]).any():
             parts.append(plain)
             continue
-        foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside) / noise.correlation.sum()
+        foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside, spot) / noise.correlation.sum()
         if foreseen < _FORESEEN * EDGE_GAIN:
             parts.append(plain)
             continue
-        at = (film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside)
-        flat, straight = fit_group(*at), fit_group(*at, edge=True)
+        fitted = partial(fit_group, film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, spot=spot)
+        flat, straight = fitted(), fitted(edge=True)
         models = [(0.0 if straight.converged.all() else -np.inf, straight)]
         for taken, bent in ((True, False), (False, True), (True, True)):
             if taken and bent and len(models) > 1 and max(models, key=lambda model: model[0]) is models[0]:
                 break  # what neither gains alone both do not
-            other = fit_group(*at, edge=True, taken=taken, bent=bent)
+            other = fitted(edge=True, taken=taken, bent=bent)
             if other.converged.all():
                 models.append((_gain(other, straight, noise) - _MORE_GAIN * (taken + bent), other))
         best, edged = max(models, key=lambda model: model[0])
         lost = plausible(plain, noise) & ~plausible(edged, noise)
         if len(g) == 1 and plain.significance[0] > _CLEAR and _gain(edged, flat, noise) >= EDGE_GAIN:
-            blurred = (fit_group(*at, blurrier=b) for b in _BLURRIER)
+            blurred = (fitted(blurrier=b) for b in _BLURRIER)
             # what film curves leave, no blur takes away
             told = [b for b in blurred if b.converged.all() and b.chi2_core[0] < _EXPLAINED * flat.chi2_core[0]]
             flat = max([flat, *told], key=lambda one: float(one.log_likelihood[0]))

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.fits import BallFits, half_size, radii, uneven, uneven_white
+from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import columns, cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.lapping import LEAST, lapping, product_image
-from rsa_vision.detect.models.profiles import ball_table
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float
 
 _STEPS = 25
@@ -40,6 +41,7 @@ def fit_group(
     taken: bool = False,
     bent: bool = False,
     blurrier: float = 0.0,
+    spot: Spot | None = None,
 ) -> BallFits:
     """Fit several balls in one window on one background.
 
@@ -61,6 +63,8 @@ def fit_group(
         It may be curved.
     blurrier : float
         Logarithm of the blur of these balls over the film's, in the same window.
+    spot : Spot, optional
+        That draws them, if it is no Gaussian; they do not lap, then.
 
     Returns
     -------
@@ -76,11 +80,11 @@ def fit_group(
     local, radius = start_px - window.corner_px, np.clip(start_radius_px, low, high).astype(np.float64)
     surface = window.surface
     weight = valid / noise.variance_at(window.raw)
-    images = images_in(window, surface, local, radius, sigma_px, mu_px)
+    images = images_in(window, surface, local, radius, sigma_px, mu_px, spot=spot)
     theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     if edge:
         surface = columns([surface.T, window.edge(data - images.value.T @ theta[:k], sigma_px)])
-        images = images_in(window, surface, local, radius, sigma_px, mu_px)
+        images = images_in(window, surface, local, radius, sigma_px, mu_px, spot=spot)
         theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     ground: Float | None = None
     converged, lost, before = False, np.zeros(k, bool), np.zeros((3, k))
@@ -108,7 +112,7 @@ def fit_group(
             if step in _LOOKED_AGAIN:
                 bare = data - images.linear[:, :k] @ theta[:k] - images.of_ground(theta)
                 surface = columns([window.surface.T, window.edge(bare, sigma_px, bent=bent)])
-        images = images_in(window, surface, local, radius, sigma_px, mu_px, ground)
+        images = images_in(window, surface, local, radius, sigma_px, mu_px, ground, spot)
         theta = weighted_least_squares(images.linear, weight, data, 1e-9)
     root = np.sqrt(weight)[:, None]
     estimator = _estimator(jac * root, size, noise)[: 4 * k]
@@ -117,7 +121,7 @@ def fit_group(
     influence = np.concatenate([estimator, _estimator(linear * root, size, noise)[:k]]).reshape(5 * k, size, size)
     whole = influence_covariance(influence, noise.correlation)
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
-    core = distance < (radius + sigma_px)[:, None]
+    core = distance < (radius + sigma_px + (spot.reach_px if spot else 0.0))[:, None]
     square = weight * residual**2
     ring = valid * ~core.any(0)
     inside = np.maximum((core * valid).sum(1), 1.0)
@@ -149,7 +153,9 @@ def _estimator(weighted: Float, size: int, noise: NoiseModel) -> Float:
     return whiten_rows(invert((white @ white.T)[None])[0] @ white, size, noise)
 
 
-def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None) -> float:
+def edge_gain(
+    film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None, spot: Spot | None = None
+) -> float:
     """Return twice the log-likelihood that an edge in the background would gain, to first order (the score test of Rao, 1948).
 
     No fit is needed for it: what is left of the window by balls that were fitted without an edge says how far one more step would get with
@@ -163,6 +169,7 @@ def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float,
     sigma_px, mu_px : float
     noise : NoiseModel
     others : callable, optional
+    spot : Spot, optional
         As of :func:`fit_group`.
 
     Returns
@@ -173,7 +180,7 @@ def edge_gain(film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float,
     window = window_around(film, fits.position_px, fits.radius_px, sigma_px, noise, others)
     weight = window.valid / noise.variance_at(window.raw)
     data = window.raw - window.neighbours
-    images = images_in(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, sigma_px, mu_px)
+    images = images_in(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, sigma_px, mu_px, spot=spot)
     theta = weighted_least_squares(images.linear, weight, data)
     edge = window.edge(data - images.value.T @ theta[: len(fits.depth)], sigma_px)
     residual, jac = data - images.linear @ theta, columns([images.jacobian(theta).T, edge])
@@ -271,13 +278,18 @@ def _under(value: Float, background: Float) -> Float:
 
 
 def images_in(
-    window: GroupWindow, surface: Float, local: Float, radius: Float, sigma_px: float, mu_px: float, ground: Float | None = None
+    window: GroupWindow,
+    surface: Float,
+    local: Float,
+    radius: Float,
+    sigma_px: float,
+    mu_px: float,
+    ground: Float | None = None,
+    spot: Spot | None = None,
 ) -> GroupImages:
     """Draw balls at places (k, 2) in a window; ``ground``: what is under them and they take their part of."""
     dx, dy = window.cols - local[:, :1], window.rows - local[:, 1:]
-    rho = np.sqrt(dx * dx + dy * dy)
-    value, slope, slope_r = ball_table(round(mu_px * sigma_px, 3)).evaluate(rho / sigma_px, radius / sigma_px)
-    slope = slope / (sigma_px * np.maximum(rho, 1e-9))
+    value, by_dx, by_dy, by_radius = shapes_of(Optics(sigma_px, mu_px), spot, dx, dy, radius)
     # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
     pairs: list[tuple[int, int]] = []
     products: list[Float] = []
@@ -288,4 +300,4 @@ def images_in(
             pairs, products, of_pairs = [*pairs, pair], [*products, product[None]], [*of_pairs, by]
     # a mark takes away its part of what is there: on linear films more beside an implant than behind it, on films of density as much
     linear = columns([value, surface.T, *([] if ground is None else [ground * value]), *products])
-    return GroupImages(value, np.stack([-slope * dx, -slope * dy, slope_r / sigma_px]), linear, ground, pairs, of_pairs)
+    return GroupImages(value, np.stack([-by_dx, -by_dy, by_radius]), linear, ground, pairs, of_pairs)

@@ -51,9 +51,9 @@ class Drawn:
         None of them where fewer than :data:`COMPANY` are explained.
     spot : Spot or None
     doubtful : ndarray of bool, shape (n,)
-        Two balls of the film's own explain these nearly as well: their covariances hold both.
+        Two balls of the film's own explain these nearly as well.
     by_spot : ndarray of shape (n, 2, 2)
-        What of the covariances of the centres is of that, and of what is not known of the spot, px^2.
+        To be added to the covariances of the centres for that, and for what is not known of the spot, px^2.
     """
 
     fits: BallFits
@@ -160,9 +160,7 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
         return nobody
     doubtful, may_be = gain < LEAST_GAIN, gain > -LEAST_GAIN
     either = np.where(doubtful[:, None, None], apart[:, :, None] * apart[:, None], 0.0)
-    covariance = fits.covariance.copy()
-    covariance[:, :2, :2] += either
-    return Drawn(replace(fits, covariance=covariance).rows(may_be), spot, doubtful[may_be], (by_spot + either)[may_be])
+    return Drawn(fits.rows(may_be), spot, doubtful[may_be], (by_spot + either)[may_be])
 
 
 def _drawn_as_well(
@@ -317,7 +315,7 @@ def _table(w: _Window, s: _State, odd: BallFits, optics: Optics, noise: NoiseMod
         position_px=s.local + w.corner,
         radius_px=s.radius,
         depth=depth,
-        covariance=scatter[:, :4, :4] + by_spot,
+        covariance=scatter[:, :4, :4],
         chi2_core=(square * core).sum(axis=1) / counted,
         chi2_ring=ring,
         chi2_uneven=under,
