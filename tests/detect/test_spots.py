@@ -79,7 +79,7 @@ def test_so_are_they_on_what_bends_under_them(name: str, scale_px: float) -> Non
     assert square[:, 1].max() < 25
 
 
-@pytest.mark.parametrize("name", SPOTS)
+@pytest.mark.parametrize("name", ["uneven peaks", "square"])
 def test_edges_beside_them_are_part_of_their_errors(name: str) -> None:
     """Every second of them lies beside or on the edge of a plate: root mean squares were twice what was stated, and half as large again."""
     squares = []
