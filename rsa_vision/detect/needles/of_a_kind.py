@@ -39,6 +39,7 @@ _ODD = 6.0  # half the chi2 by which chance makes a pin of the known size worse 
 _PALE = 0.5  # of the typical depth
 # logarithms of half width and length: how far first looks of one kind differ, and pins of one; part of a film's pins that are of one
 _ROUGHLY_ALIKE, _ALIKE, _MOST = 0.35, 0.12, 0.6
+_AT_ALL_ALIKE = float(np.log(2.0))  # the same of pins in much noise
 _TELL, _SAME_LENGTH = 6, 0.05  # pins of a film that tell what is odd; logarithm of the lengths of one kind
 
 
@@ -128,7 +129,7 @@ def without_company(pins: list[NeedleFit]) -> list[bool]:
     if not pins:
         return []
     sizes = _log_sizes(pins)
-    alike = (np.abs(sizes[:, None] - sizes) < _ROUGHLY_ALIKE).all(axis=2)
+    alike = (np.abs(sizes[:, None] - sizes) < _AT_ALL_ALIKE).all(axis=2)
     return [bool(few) for few in alike.sum(axis=1) < LEAST_OF_A_KIND]
 
 
