@@ -179,13 +179,13 @@ def resolve_balls(
     found, edged = found.rows(balls), edged[balls]
     of_spot, at_edge = _drawn_beside_edges(film, drawn, optics, noise, needles)
     n, every = len(found.depth), join([found, of_spot])
-    by_spot = np.arange(len(every.depth)) >= n
+    is_drawn = np.arange(len(every.depth)) >= n
     touching = np.append(np.zeros(n, bool), drawn.doubtful)
     for g in groups_of(every, optics):
         touching[g] |= len(g) > 1
     none = np.zeros(len(every.depth), bool)
     edged = np.append(edged, at_edge)
-    return Balls(every, touching, edged, none, by_spot, np.concatenate([np.zeros((n, 2, 2)), drawn.by_spot]), drawn.spot)
+    return Balls(every, touching, edged, none, is_drawn, np.concatenate([np.zeros((n, 2, 2)), drawn.by_spot]), drawn.spot)
 
 
 def _drawn_beside_edges(

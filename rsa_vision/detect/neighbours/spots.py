@@ -167,6 +167,8 @@ def _drawn_as_well(
     film: NDArray[Any], clean: BallFits, spot: _State, kept: Bool, half: int, optics: Optics, noise: NoiseModel, others: Any
 ) -> Bool:
     """Say which of these the spot explains better than a Gaussian does, as balls of the size of those that told it."""
+    if len(clean.depth) == 0:
+        return np.zeros(0, bool)
     usual = float(np.median(spot.radius[kept]))
     window = _window(film, clean, half, others, noise)
     drawn, plain = (_at_rest(window, clean, along, optics, noise) for along in (spot.along, np.zeros(4)))
