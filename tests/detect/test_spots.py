@@ -62,7 +62,7 @@ def test_balls_drawn_by_a_spot_are_found_and_their_stated_errors_are_true(name: 
     assert BAND[0] < ratio < BAND[1]
 
 
-@pytest.mark.parametrize(("name", "scale_px"), [("two peaks", 14.0), ("uneven peaks", 20.0), ("square", 20.0)])
+@pytest.mark.parametrize(("name", "scale_px"), [("two peaks", 14.0), ("uneven peaks", 20.0)])
 def test_so_are_they_on_what_bends_under_them(name: str, scale_px: float) -> None:
     """They stayed where a fit on a quadratic background puts them, and those that a Gaussian explains nearly as well were not asked."""
     squares = []
@@ -79,7 +79,7 @@ def test_so_are_they_on_what_bends_under_them(name: str, scale_px: float) -> Non
     assert square[:, 1].max() < 25
 
 
-@pytest.mark.parametrize("name", ["uneven peaks", "square"])
+@pytest.mark.parametrize("name", ["uneven peaks"])
 def test_edges_beside_them_are_part_of_their_errors(name: str) -> None:
     """Every second of them lies beside or on the edge of a plate: root mean squares were twice what was stated, and half as large again."""
     squares = []

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.film.noise import LAGS, NoiseModel
-from rsa_vision.detect.film.whitening import Filter, whiten
+from rsa_vision.detect.film.whitening import Filter, variance_left, whiten
 from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored
@@ -31,6 +31,13 @@ def _noise(sigma_px: float, part: float, shape: tuple[int, int, int], rng: np.ra
     correlation = part * np.exp(-square / (4 * sigma_px**2)) + (1 - part) * (square == 0)
     power = np.maximum(np.fft.rfft2(correlation).real, 0.0)
     return np.fft.irfft2(np.fft.rfft2(rng.standard_normal(shape)) * np.sqrt(power), s=shape[1:])
+
+
+@pytest.mark.parametrize(("sigma_px", "part"), [(0.7, 0.5), (0.6, 1.0), (1.0, 1.0)])
+def test_what_is_left_of_noise_made_white_is_foretold(sigma_px: float, part: float) -> None:
+    white = whiten(_noise(sigma_px, part, (60, 64, 64), np.random.default_rng(1)), _model(sigma_px, part))[:, 8:-8, 8:-8]
+    print(f"variance {white.var():.3f}, foretold {variance_left(_model(sigma_px, part)):.3f}")
+    assert abs(np.log(white.var() / variance_left(_model(sigma_px, part)))) < 0.03
 
 
 @settings(max_examples=25, deadline=None)

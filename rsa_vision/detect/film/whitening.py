@@ -85,10 +85,32 @@ def whiten_rows(windows: NDArray[Any], side: int, noise: NoiseModel) -> NDArray[
     return whiten(windows.reshape(-1, side, side), noise).reshape(windows.shape)
 
 
+def variance_left(noise: NoiseModel) -> float:
+    """Return the variance of noise of variance one that was made white: less than one where some frequency is not believed to be so quiet.
+
+    Parameters
+    ----------
+    noise : NoiseModel
+
+    Returns
+    -------
+    float
+    """
+    if noise.is_white:
+        return 1.0
+    power, believed = _powers(noise.correlation.tobytes(), len(noise.correlation))
+    part = np.maximum(power, 0.0) / believed
+    return float((2 * part.sum() - part[:, [0, -1]].sum()) / _PERIOD**2)  # all but the first and the last frequency stand for two
+
+
+def _powers(correlation: bytes, side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Power of the noise at the frequencies of ``rfft2``, and what of it is believed."""
+    power = power_spectrum(np.frombuffer(correlation).reshape(side, side), (_PERIOD, _PERIOD))
+    return power, power + max(0.0, _LEAST_POWER - power.min())
+
+
 @lru_cache(maxsize=64)
 def _kernel(correlation: bytes, side: int) -> NDArray[np.float64]:
-    power = power_spectrum(np.frombuffer(correlation).reshape(side, side), (_PERIOD, _PERIOD))
-    power += max(0.0, _LEAST_POWER - power.min())
-    kernel = np.fft.irfft2(1 / np.sqrt(power), s=(_PERIOD, _PERIOD))
+    kernel = np.fft.irfft2(1 / np.sqrt(_powers(correlation, side)[1]), s=(_PERIOD, _PERIOD))
     reach = int(np.flatnonzero(np.abs(kernel[0, : _REACH + 1]) > _NOTHING * kernel[0, 0]).max())
     return np.asarray(np.roll(kernel, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1].copy())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.fits import BallFits, mirrored, slopes
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
-from rsa_vision.detect.film.whitening import whiten_rows
+from rsa_vision.detect.film.whitening import variance_left, whiten_rows
 from rsa_vision.detect.models.profiles import Optics, ball_table
 from rsa_vision.detect.neighbours.beside import Beside
 from rsa_vision.types import Float
@@ -99,4 +99,4 @@ def _squares(film: NDArray[Any], balls: BallFits, i: int, beside: Beside, optics
         under &= np.hypot(dx, dy)[0] > _NEXT_PX
     # of a pair either half counts; what a fit takes up of one it takes up of the other
     free = np.maximum(1 - 2 * np.square(basis).sum(axis=1), 0.2)
-    return expected[0, under], (np.square(rest) / free)[under]
+    return expected[0, under], (np.square(rest) / free)[under] / variance_left(noise)
