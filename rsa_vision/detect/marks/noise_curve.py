@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.fits import BallFits, mirrored, slopes
+from rsa_vision.detect.balls.fits import BallFits, mirrored
+from rsa_vision.detect.balls.focal_spot import shapes_of
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.whitening import variance_left, whiten_rows
-from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import Beside
 from rsa_vision.types import Float
 
@@ -55,7 +56,8 @@ def noise_by_value(film: NDArray[Any], balls: BallFits, beside: Beside, optics: 
         return None
     order = np.array_split(np.argsort(value), parts)
     level = np.array([value[these].mean() for these in order])
-    variance = noise.variance_at(level) * [s[s <= _OUTLIER * np.median(s)].mean() for s in (square[these] for these in order)]
+    left = [of[of <= _OUTLIER * np.median(of)].mean() for of in (square[these] for these in order)]
+    variance = noise.variance_at(level) * left / variance_left(noise)
     beside_them = float(np.median(noise.variance_at(balls.background)))
     if variance.max() < _MORE * beside_them:
         return None
@@ -81,8 +83,7 @@ def _squares(film: NDArray[Any], balls: BallFits, i: int, beside: Beside, optics
     images, doubtful = beside(i, cols, rows)
     valid = (patches.valid[0] & ~doubtful).reshape(1, -1)
     dx, dy = (of.reshape(1, -1) - at for of, at in zip((cols, rows), balls.position_px[i], strict=True))
-    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
-    opacity, by_x, by_y, _ = slopes(table, dx, dy, balls.radius_px[[i]], optics.sigma_px)
+    opacity, by_x, by_y, _ = shapes_of(optics, None, dx, dy, balls.radius_px[[i]])
     left = (patches.values[0] - images).reshape(1, -1) - balls.depth[i] * opacity
     expected = balls.background[i] + balls.depth[i] * opacity
     opposite = mirrored(balls.position_px[[i]] - patches.corner_px, patches.size)
@@ -99,4 +100,4 @@ def _squares(film: NDArray[Any], balls: BallFits, i: int, beside: Beside, optics
         under &= np.hypot(dx, dy)[0] > _NEXT_PX
     # of a pair either half counts; what a fit takes up of one it takes up of the other
     free = np.maximum(1 - 2 * np.square(basis).sum(axis=1), 0.2)
-    return expected[0, under], (np.square(rest) / free)[under] / variance_left(noise)
+    return expected[0, under], (np.square(rest) / free)[under]

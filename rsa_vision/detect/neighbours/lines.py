@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.decide import LEAST_KNOWN, height_of, look_clear
 from rsa_vision.detect.balls.find import BATCH, no_fits
-from rsa_vision.detect.balls.fits import BallFits, half_size, join, slopes
+from rsa_vision.detect.balls.fits import BallFits, half_size, join
+from rsa_vision.detect.balls.focal_spot import shapes_of
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut, damped_solution
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.edge import edge_profile
-from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, all_but, groups_of, images_beside
 from rsa_vision.detect.neighbours.groups import fit_group, square
 from rsa_vision.detect.neighbours.rims import goes_on
@@ -137,8 +138,7 @@ def _gains(film: NDArray[Any], at_px: Float, radius_px: float, optics: Optics, n
     half = half_size(radius_px, optics.sigma_px)
     patches, (cols, rows, surface) = cut(film, at_px, half, noise), square(half)
     n, local, radius = len(at_px), at_px - patches.corner_px, np.full(len(at_px), radius_px)
-    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
-    balls = np.stack(slopes(table, cols - local[:, :1], rows - local[:, 1:], radius, optics.sigma_px), axis=1)
+    balls = np.stack(shapes_of(optics, None, cols - local[:, :1], rows - local[:, 1:], radius), axis=1)
     raw, valid = patches.values.reshape(n, -1), patches.valid.reshape(n, -1).astype(np.float64)
     root = np.sqrt(valid / noise.variance_at(raw))
     first, end = balls.shape[1], balls.shape[1] + surface.shape[1]  # the background, between the ball and the line
