@@ -212,8 +212,13 @@ def around_each(figures: list[Float], places: list[Places], count: int, least: f
         return np.ones((count, width))
     together = np.concatenate(logs)
     apart = sum(len(np.unique(these.cell, axis=0)) for these in places)
-    sure = quantile + _SURE * np.sqrt(quantile * (1 - quantile) / apart)
+    chance = np.sqrt(quantile * (1 - quantile) / apart)
+    sure = quantile + _SURE * chance
     usual, high = np.quantile(together, [quantile, min(sure, 1.0)], axis=0)
+    around = np.quantile(together, np.clip(quantile + chance * np.array([-1, 1]), 0.0, 1.0), axis=0)
+    # more than was promised is believed as far as it is not chance (James and Stein, Fourth Berkeley Symposium, 1961)
+    by_chance = np.square(0.5 * (around[1] - around[0]))
+    usual = np.where(usual > 0, usual * np.maximum(1 - by_chance / np.maximum(usual, 1e-9) ** 2, 0.0), usual)
     # less than was promised is believed as far as it cannot be chance
     caution = np.maximum((np.minimum(high, 0.0) if sure < 1 else 0.0) - usual, 0.0)
     usual_error = error[enough].mean(axis=0)

@@ -19,7 +19,8 @@ from rsa_vision.types import Float
 
 _LEAST = 8  # balls that tell something
 _QUIET = 1.25  # less variance than this around a ball, in units of the noise, is noise
-_MOST_PARTS, _PAIRS = 5, 100  # of the values under balls, and pairs of pixels in each
+_MOST_PARTS, _PAIRS = 24, 100  # of the values under balls, and pairs of pixels in each
+_WIDE = 5  # of them that many may be looked at by themselves
 _UNDER = 0.1  # of full opacity, from which a pixel is under a ball
 _OUTLIER = 25.0  # times the median of the squares, of which noise makes none
 _MORE = 1.5  # times the variance beside them, which is worth a curve
@@ -58,8 +59,9 @@ def noise_by_value(film: NDArray[Any], balls: BallFits, beside: Beside, optics: 
     level = np.array([value[these].mean() for these in order])
     left = [of[of <= _OUTLIER * np.median(of)].mean() for of in (square[these] for these in order)]
     variance = noise.variance_at(level) * left / variance_left(noise)
-    beside_them = float(np.median(noise.variance_at(balls.background)))
-    if variance.max() < _MORE * beside_them:
+    beside_them = float(noise.variance_at(balls.background).min())
+    together = parts // _WIDE + 1  # as many as chance does not lift
+    if np.convolve(variance, np.full(together, 1 / together), "valid").max() < _MORE * beside_them:
         return None
     # middles that are quieter would decide where a ball is, by what its model is not exactly
     return _with_levels(noise, level, np.maximum(variance, beside_them), balls)
