@@ -16,6 +16,7 @@ from rsa_vision.detect.needles.equations import Equations
 from rsa_vision.types import Float
 
 _SURE = 4.0  # standard deviations of what noise alone leaves
+_WIDE = 3.0  # times the blur: what is as smooth as that is background to a tip
 
 
 def louder(window: Window, e: Equations, own: Float, common: Float, sigma_px: float) -> float:
@@ -36,19 +37,38 @@ def louder(window: Window, e: Equations, own: Float, common: Float, sigma_px: fl
     float
     """
     left = e.residual - own @ e.own - common @ e.common
-    square = float(np.square(_smooth(window, left[None], sigma_px)).sum())
-    # what noise comes to: the squares of the weights with which a pixel's surroundings enter it, those within the window
-    kept = 1 / (4 * np.pi * sigma_px**2)
-    expected = kept * float(_smooth(window, np.ones((1, len(left))), sigma_px / np.sqrt(2)).sum())
+    square = float(np.square(_band(window, left[None], sigma_px)).sum())
+    kept, expected = _of_noise(window, len(left), sigma_px)
     if square < expected:
         return 1.0
-    smooth = _smooth(window, e.own, sigma_px)
-    expected -= float((e.inverse * (smooth @ smooth.T)).sum())  # fits take up a part of it
+    band = _band(window, e.own, sigma_px)
+    expected -= float((e.inverse * (band @ band.T)).sum())  # fits take up a part of it
     if expected <= 0:
         return 1.0
     ratio = square / expected
     # as many independent values as the squares of what neighbours share leave of the pixels
     return ratio if ratio > 1 + _SURE * np.sqrt(4 * np.pi * sigma_px**2 * kept / expected) else 1.0
+
+
+def _band(window: Window, values: Float, sigma_px: float) -> Float:
+    """Leave the frequencies of images of values at the pixels of a window, shape (p, n)."""
+    fine, coarse = (_smooth(window, values, sigma) for sigma in (sigma_px, _WIDE * sigma_px))
+    return np.asarray(fine - coarse, np.float64)
+
+
+def _of_noise(window: Window, count: int, sigma_px: float) -> tuple[float, float]:
+    """Return the part of the variance of white noise in that band, and what its squares come to over the pixels of a window.
+
+    The squares of the weights with which a pixel's surroundings enter it, those within the window.
+    """
+    ones, wide = np.ones((1, count)), _WIDE * sigma_px
+    parts = []
+    for factor, one, other in ((1, sigma_px, sigma_px), (-2, sigma_px, wide), (1, wide, wide)):
+        both = one**2 + other**2  # a product of two Gaussians is a third
+        kept = factor / (2 * np.pi * both)
+        parts.append((kept, kept * float(_smooth(window, ones, one * other / np.sqrt(both)).sum())))
+    kept, expected = np.sum(parts, axis=0)
+    return float(kept), float(expected)
 
 
 def _smooth(window: Window, values: Float, sigma_px: float) -> NDArray[np.float32]:

@@ -20,7 +20,6 @@ _DIRECTIONS = 2 * np.pi * np.arange(8) / 8
 _ENOUGH, _SPARSEST = 400, 3  # places of a film, from which only every second or third around each is looked at
 _FARTHER = (1.0, 1.5, 2.2)  # distances, in units of the size of the window
 _MEDIAN = float(chdtri(1.0, 0.5))  # of a square of variance one
-_OF_MEDIAN, _SURE = 2.33, 2.0  # relative error of the median of such squares times the root of their number; standard deviations
 _LEAST = 0.1  # of what noise does, of which less is none
 
 
@@ -90,8 +89,7 @@ def errors_by_ground(
         places.append(Places(0, np.arange(first, counts[-1])[: len(e.members)], near, cell, np.zeros((len(near), 0))))
         variances.append(variance)
     more = around_each(figures, places, len(members), _LEAST) - 1.0
-    apart = sum(len(np.unique(these.cell, axis=0)) for these in places)
-    more[more < _SURE * _OF_MEDIAN / np.sqrt(max(apart, 1))] = 0.0  # as much comes of noise
+    more = np.maximum(more, 0.0)
     extra = np.einsum("mb,mba,mbc->mac", more * np.concatenate(variances), axes, axes)
     return np.split(extra, counts[1:-1])
 
