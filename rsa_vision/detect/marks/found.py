@@ -30,6 +30,7 @@ from rsa_vision.detect.needles.pins import find_pins
 from rsa_vision.detect.needles.sets import is_located, on_arms
 from rsa_vision.detect.needles.tees import find_tees, is_tee
 from rsa_vision.detect.neighbours.beside import images_beside, lapping_balls
+from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.neighbours.rims import goes_on
 from rsa_vision.detect.search.candidates import Candidates
@@ -236,7 +237,7 @@ def _measured(
     touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, by_size, touching, poor = balls.rows(keep), ratio[keep], by_size[keep], touching[keep], poor[keep]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
-    doubtful = lost_in_a_crowd(balls, _off_needles(faint, others))
+    doubtful = lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
     return table_of(film, bits, balls, under, ratio, by_size, touching, poor, doubtful, others, faint.junctions, optics, noise)
 
 

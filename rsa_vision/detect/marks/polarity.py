@@ -22,6 +22,7 @@ from rsa_vision.detect.needles.noise_along import noise_under_needles
 from rsa_vision.detect.needles.pins import on_pins, optics_of_pins
 from rsa_vision.detect.needles.pointed import is_slim
 from rsa_vision.detect.needles.tees import GUESS, first_tees, optics_of_tees
+from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
 
@@ -108,7 +109,8 @@ def first_looks(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit
 
 def _look(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> BallFits:
     looks = first_look(film, candidates, noise)
-    return off_pins(looks.rows(noise.rises_above(height_of(looks, COARSE_SIGMA_PX), looks.background)), pins)
+    looks = looks.rows(noise.rises_above(height_of(looks, COARSE_SIGMA_PX), looks.background))
+    return off_pins(looks.rows(~are_holes(film, looks, COARSE_SIGMA_PX)), pins)
 
 
 def off_pins(fits: BallFits, pins: list[NeedleFit]) -> BallFits:
