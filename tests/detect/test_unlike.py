@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.balls.unlike import too_pale
+from rsa_vision.detect.balls.unlike import of_odd_size, too_deep, too_pale
 from rsa_vision.flags import MarkerFlag
 
 from .films import film_of_balls, grid_of_balls, stored
@@ -108,3 +108,28 @@ def test_what_is_too_pale_is_no_company_for_an_odd_size() -> None:
         index, gap = nearest(truth, found)
         assert gap.max() < 0.3
         assert np.flatnonzero(found.images.flags[index] == MarkerFlag.UNLIKE).tolist() == expected
+
+
+@pytest.mark.parametrize("response", [linear, arched, level])
+def test_what_is_twice_as_deep_as_balls_on_darker_and_lighter_film_is_none_of_their_metal(response: Response) -> None:
+    rng = np.random.default_rng(6)
+    background = np.linspace(0.3, 0.9, 24)
+    depth = response(background) * rng.uniform(0.7, 1.0, 24) * (1 + SD * rng.standard_normal(24))
+    known = np.ones(24, bool)
+    assert not too_deep(depth, (SD * depth) ** 2, background, known).any()
+    things = [8, 9, 14]
+    depth[things] = 2.2 * response(background)[things]
+    assert np.flatnonzero(too_deep(depth, (SD * depth) ** 2, background, known)).tolist() == things
+    assert not too_deep(depth, (0.5 * depth) ** 2, background, known).any()  # doubtful ones
+    assert not too_deep(depth[:5], (SD * depth[:5]) ** 2, background[:5], known[:5]).any()  # a film of few
+
+
+@pytest.mark.parametrize(("small", "flagged"), [(4, True), (5, True), (6, False), (9, False)])
+def test_a_few_of_half_the_size_of_two_dozen_are_dots_and_not_beads(small: int, flagged: bool) -> None:
+    """A date has two colons; a bone has half a dozen of its own beads, or the cage has larger ones."""
+    rng = np.random.default_rng(7)
+    size = np.append(rng.normal(6.0, 0.4, 24), rng.normal(3.0, 0.05, small))
+    odd = of_odd_size(size, np.full(len(size), 0.02**2))
+    assert odd[24:].all() == odd[24:].any() == flagged
+    assert not of_odd_size(size[:24], np.full(24, 0.2**2)).any()
+    assert not of_odd_size(np.append(np.full(24, 6.0), np.full(4, 4.5)), np.full(28, 0.02**2)).any()  # 0.8 and 0.6 mm

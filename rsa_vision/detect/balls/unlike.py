@@ -10,13 +10,17 @@ from rsa_vision.types import Bool, Float
 
 COMPANY = 6  # marks of one kind that tell what is unlike them
 _ALIKE, _APART = 0.035, 3.0  # of radii of one kind, where curve and background differ; standard deviations
+_SMALL, _FEW, _TIMES = 0.65, 6, 3  # of the usual size; fewer have that, and so many times as many do not: dust, dots of a date
 _BESIDE = 5  # known balls nearest in background, on either side
+_ENOUGH = 3  # of them, whose median is theirs
 _SCATTERED = 0.6  # the part of one and the same film value that is primary radiation differs by no more: from 0.5 to 0.8 of it
 _CHANCE = 2.0  # standard deviations of two depths, each
 
 
 def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> Bool:
-    """Say which have a size that hardly another of the film has, where there are enough of one size: dots of letters, screw tips.
+    """Say which have a size that hardly another of the film has, where there are enough of one size: dots of letters, screw tips, dust.
+
+    Subjects have beads of one size in one bone and of another elsewhere, but not three of half the size of a few dozen.
 
     Parameters
     ----------
@@ -32,7 +36,12 @@ def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> B
     size, variance = np.log(size_px), variance_px2 / size_px**2
     apart = np.abs(size[:, None] - size) / np.sqrt(variance[:, None] + variance + alike**2)
     company = (apart < _APART).sum(axis=1)
-    return np.asarray((company < LEAST_KNOWN) & (company.max(initial=0) >= COMPANY))
+    most = company.max(initial=0)
+    if most < COMPANY:
+        return np.zeros(len(size), bool)
+    small = size < np.log(_SMALL) + size[company.argmax()]
+    fellows = (np.abs(size[:, None] - size) < -np.log(_SMALL)).sum(axis=1)
+    return np.asarray((company < LEAST_KNOWN) | (small & (fellows < _FEW) & (_TIMES * fellows <= np.count_nonzero(~small))))
 
 
 def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:
@@ -83,3 +92,30 @@ def _between(depth: Float, background: Float, marks: Bool, i: int) -> float:
     nearest = [side[np.argsort(np.abs(offset[side]), kind="stable")[:_BESIDE]] for side in sides]
     ends = [side[np.argmax(depth[side])] for side in nearest]
     return max(float(np.interp(0.0, offset[ends], depth[ends])), 0.0)
+
+
+def too_deep(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:
+    """Say which balls are deeper than those of the film on darker and on lighter values by more than scatter explains: dust on the film.
+
+    No ball of their metal can be, however small: depths are those of full opacity.
+
+    Parameters
+    ----------
+    depth, variance, background, known
+        As of :func:`too_pale`.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None where too few are known.
+    """
+    if np.count_nonzero(known) < COMPANY:
+        return np.zeros(len(depth), bool)
+    usual = np.full(len(depth), np.inf)
+    for i, at in enumerate(background):
+        others = known & (np.arange(len(depth)) != i)
+        sides = [np.flatnonzero(others & side) for side in (background <= at, background > at)]
+        if min(len(side) for side in sides) >= _ENOUGH:
+            nearest = [side[np.argsort(np.abs(background[side] - at), kind="stable")[:_BESIDE]] for side in sides]
+            usual[i] = max(float(np.median(depth[side])) for side in nearest)
+    return np.asarray(_SCATTERED * (depth - _CHANCE * np.sqrt(variance)) > usual)

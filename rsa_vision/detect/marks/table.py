@@ -12,7 +12,7 @@ from rsa_vision.detect.balls.decide import EDGE, height_of
 from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, MISFIT, misfit
 from rsa_vision.detect.balls.fits import BallFits, radii
 from rsa_vision.detect.balls.optics import CAP, OF_CUT_OFF
-from rsa_vision.detect.balls.unlike import COMPANY, of_odd_size, too_pale
+from rsa_vision.detect.balls.unlike import COMPANY, of_odd_size, too_deep, too_pale
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.resolve import doubt_of_number
 from rsa_vision.detect.marks.settle import STRUCTURE
@@ -136,7 +136,8 @@ def table_of(
     flags[:n][lost] |= MarkerFlag.POOR_FIT
     flags[n:][np.linalg.eigvalsh(covariance[n:])[:, -1] > (2 * radius[n:]) ** 2] |= MarkerFlag.POOR_FIT
     pale = too_pale(depth[:n], balls.covariance[:, 3, 3], balls.background, flags[:n] == 0)
-    marks = np.flatnonzero(~pale)  # what is none is no company for another's odd size
+    pale |= too_deep(depth[:n], balls.covariance[:, 3, 3], balls.background, flags[:n] & ~MarkerFlag.OVERLAP == 0)
+    marks = np.flatnonzero(~pale & ~poor[:n])  # what is none is no company for another's odd size
     odd = marks[of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])]
     flags[np.append(np.flatnonzero(pale | doubtful), odd)] |= MarkerFlag.UNLIKE
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
