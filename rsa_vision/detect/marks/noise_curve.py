@@ -19,7 +19,7 @@ from rsa_vision.types import Float
 
 _LEAST = 8  # balls that tell something
 _QUIET = 1.25  # less variance than this around a ball, in units of the noise, is noise
-_MOST_PARTS, _PAIRS = 24, 100  # of the values under balls, and pairs of pixels in each
+_PARTS, _PAIRS = (5, 24), (100, 250)  # of the values under balls, and pairs of pixels in each of so few and of more
 _WIDE = 5  # of them that many may be looked at by themselves
 _UNDER = 0.1  # of full opacity, from which a pixel is under a ball
 _OUTLIER = 25.0  # times the median of the squares, of which noise makes none
@@ -52,7 +52,7 @@ def noise_by_value(film: NDArray[Any], balls: BallFits, beside: Beside, optics: 
         return None
     told = [_squares(film, balls, i, beside, optics, noise) for i in quiet.tolist()]
     value, square = (np.concatenate(of) for of in zip(*told, strict=True))
-    parts = min(_MOST_PARTS, len(value) // (2 * _PAIRS))
+    parts = max(min(most, len(value) // (2 * pairs)) for most, pairs in zip(_PARTS, _PAIRS, strict=True))
     if parts < 2:
         return None
     order = np.array_split(np.argsort(value), parts)

@@ -14,6 +14,8 @@ _NEAR, _FAR, _STEP, _BLURS = 1.5, 5.0, 0.4, 1.5  # of the radius, where rays beg
 _WAYS = 16
 _AS_MUCH = 0.6  # of the height over what lies around
 _OPPOSITE = 4  # pairs of opposite rays of eight: along a plate there is no end near
+_PLATE = 3  # holes of one size: one bright disc beyond which all is dark may as well be a ball in a small field
+_SIZE, _HEIGHT = 0.15, 0.7  # logarithms by which they differ
 _ACROSS = np.array([[0.0, 0.0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * 0.3  # of the radius: pixels that are averaged
 
 
@@ -32,6 +34,7 @@ def are_holes(film: NDArray[Any], fits: BallFits, sigma_px: float) -> Bool:
     Returns
     -------
     ndarray of bool, shape (n,)
+        None where there are fewer of one size than a plate has.
     """
     radius, sign = fits.radius_px[:, None, None], np.sign(fits.depth)
     middle = sign * _values(film, fits.position_px[:, None], radius)[:, 0]
@@ -42,7 +45,10 @@ def are_holes(film: NDArray[Any], fits: BallFits, sigma_px: float) -> Bool:
     around = np.median(beyond[0], axis=1)
     as_much = np.max(beyond - around[:, None], axis=0) > _AS_MUCH * (middle - around)[:, None]
     both = as_much[:, : _WAYS // 2] & as_much[:, _WAYS // 2 :]
-    return np.asarray((middle > around) & (both.sum(axis=1) >= _OPPOSITE))
+    holes = (middle > around) & (both.sum(axis=1) >= _OPPOSITE)
+    size, height = np.log(fits.radius_px), np.log(np.maximum(middle - around, 1e-9))
+    alike = (np.abs(size[:, None] - size) < _SIZE) & (np.abs(height[:, None] - height) < _HEIGHT)
+    return np.asarray(holes & ((alike & holes).sum(axis=1) >= _PLATE))
 
 
 def _values(film: NDArray[Any], places: Float, radius: Float) -> Float:
