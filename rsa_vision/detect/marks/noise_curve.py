@@ -20,7 +20,7 @@ from rsa_vision.types import Float
 _LEAST = 8  # balls that tell something
 _QUIET = 1.25  # less variance than this around a ball, in units of the noise, is noise
 _PARTS, _PAIRS = (5, 24), (100, 250)  # of the values under balls, and pairs of pixels in each of so few and of more
-_WIDE = 5  # of them that many may be looked at by themselves
+_ALONE = 5  # parts; of more, neighbours are looked at together, lest one is high by chance
 _UNDER = 0.1  # of full opacity, from which a pixel is under a ball
 _OUTLIER = 25.0  # times the median of the squares, of which noise makes none
 _MORE = 1.5  # times the variance beside them, which is worth a curve
@@ -60,7 +60,7 @@ def noise_by_value(film: NDArray[Any], balls: BallFits, beside: Beside, optics: 
     left = [of[of <= _OUTLIER * np.median(of)].mean() for of in (square[these] for these in order)]
     variance = noise.variance_at(level) * left / variance_left(noise)
     beside_them = float(noise.variance_at(balls.background).min())
-    together = parts // _WIDE + 1  # as many as chance does not lift
+    together = -(-parts // _ALONE)
     if np.convolve(variance, np.full(together, 1 / together), "valid").max() < _MORE * beside_them:
         return None
     # middles that are quieter would decide where a ball is, by what its model is not exactly

@@ -46,9 +46,10 @@ def are_holes(film: NDArray[Any], fits: BallFits, sigma_px: float) -> Bool:
     as_much = np.max(beyond - around[:, None], axis=0) > _AS_MUCH * (middle - around)[:, None]
     both = as_much[:, : _WAYS // 2] & as_much[:, _WAYS // 2 :]
     holes = (middle > around) & (both.sum(axis=1) >= _OPPOSITE)
-    size, height = np.log(fits.radius_px), np.log(np.maximum(middle - around, 1e-9))
+    size, height = np.log(fits.radius_px[holes]), np.log((middle - around)[holes])
     alike = (np.abs(size[:, None] - size) < _SIZE) & (np.abs(height[:, None] - height) < _HEIGHT)
-    return np.asarray(holes & ((alike & holes).sum(axis=1) >= _PLATE))
+    holes[holes] = alike.sum(axis=1) >= _PLATE
+    return np.asarray(holes)
 
 
 def _values(film: NDArray[Any], places: Float, radius: Float) -> Float:
