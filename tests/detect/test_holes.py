@@ -53,15 +53,24 @@ def test_balls_are_found_beside_a_plate_and_its_holes_are_none(balls: Float, bri
     assert len(images) <= len(balls)
 
 
-def test_a_ball_beside_the_edge_of_something_denser_is_no_hole() -> None:
+def seen(places: Float, depth: float) -> BallFits:
+    """Return as much of fits as is asked for."""
+    some = SimpleNamespace(position_px=places, radius_px=np.full(len(places), RADIUS_PX), depth=np.full(len(places), depth))
+    return cast(BallFits, some)
+
+
+def test_balls_beside_the_edge_of_something_denser_are_no_holes() -> None:
+    """As many as a plate has holes, of one size: one side of them only is as dark."""
     rng = np.random.default_rng(3)
-    place = np.array([[300.0, 300.0]])
-    ball = cast(BallFits, SimpleNamespace(position_px=place, radius_px=np.array([RADIUS_PX]), depth=np.array([-1.0])))
-    light = film_of_balls((SIDE, SIDE), place, np.array([RADIUS_PX]), background=1.0, depth=0.3)
+    places = np.array([[300.0, 120.0], [300.0, 300.0], [300.0, 480.0]])
+    light = film_of_balls((SIDE, SIDE), places, np.full(3, RADIUS_PX), background=1.0, depth=0.3)
     for gap in (1.2, 2.0, 3.0):
         beside = light.copy()
         beside[:, : round(300 - gap * RADIUS_PX)] *= 0.3
-        assert not are_holes(beside + 0.01 * rng.standard_normal(light.shape), ball, 1.0)[0]
-    hole, holes = plated(np.ones((SIDE, SIDE)))
-    of_plate = SimpleNamespace(position_px=holes, radius_px=np.full(len(holes), RADIUS_PX), depth=np.ones(len(holes)))
-    assert are_holes(hole, cast(BallFits, of_plate), 1.0).all()
+        assert not are_holes(beside + 0.01 * rng.standard_normal(light.shape), seen(places, -1.0), 1.0).any()
+
+
+def test_a_plate_has_several_holes_and_a_small_field_may_have_one_ball() -> None:
+    film, holes = plated(np.ones((SIDE, SIDE)))
+    assert are_holes(film, seen(holes, 1.0), 1.0).all()
+    assert not are_holes(film, seen(holes[:2], 1.0), 1.0).any()

@@ -6,7 +6,7 @@ import numpy as np
 
 from rsa_vision.detect.balls.alike import SD_OF_MAD
 from rsa_vision.detect.balls.decide import LEAST_KNOWN
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
 COMPANY = 6  # marks of one kind that tell what is unlike them
 _ALIKE, _APART = 0.035, 3.0  # of radii of one kind, where curve and background differ; standard deviations
@@ -82,18 +82,6 @@ def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> B
         pale |= paler
 
 
-def _between(depth: Float, background: Float, marks: Bool, i: int) -> float:
-    """Depth that a mark has at least on a background between those of others; 0 where it lies between none."""
-    offset = background - background[i]
-    others = marks & (np.arange(len(depth)) != i)
-    sides = [np.flatnonzero(others & side) for side in (offset <= 0, offset > 0)]
-    if min(len(side) for side in sides) == 0:
-        return 0.0
-    nearest = [side[np.argsort(np.abs(offset[side]), kind="stable")[:_BESIDE]] for side in sides]
-    ends = [side[np.argmax(depth[side])] for side in nearest]
-    return max(float(np.interp(0.0, offset[ends], depth[ends])), 0.0)
-
-
 def too_deep(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:
     """Say which balls are deeper than those of the film on darker and on lighter values by more than scatter explains: dust on the film.
 
@@ -112,10 +100,25 @@ def too_deep(depth: Float, variance: Float, background: Float, known: Bool) -> B
     if np.count_nonzero(known) < COMPANY:
         return np.zeros(len(depth), bool)
     usual = np.full(len(depth), np.inf)
-    for i, at in enumerate(background):
-        others = known & (np.arange(len(depth)) != i)
-        sides = [np.flatnonzero(others & side) for side in (background <= at, background > at)]
-        if min(len(side) for side in sides) >= _ENOUGH:
-            nearest = [side[np.argsort(np.abs(background[side] - at), kind="stable")[:_BESIDE]] for side in sides]
+    for i in range(len(depth)):
+        nearest = _beside(background, known, i)
+        if min(map(len, nearest)) >= _ENOUGH:
             usual[i] = max(float(np.median(depth[side])) for side in nearest)
     return np.asarray(_SCATTERED * (depth - _CHANCE * np.sqrt(variance)) > usual)
+
+
+def _between(depth: Float, background: Float, marks: Bool, i: int) -> float:
+    """Depth that a mark has at least on a background between those of others; 0 where it lies between none."""
+    nearest = _beside(background, marks, i)
+    if min(map(len, nearest)) == 0:
+        return 0.0
+    ends = [side[np.argmax(depth[side])] for side in nearest]
+    return max(float(np.interp(background[i], background[ends], depth[ends])), 0.0)
+
+
+def _beside(background: Float, marks: Bool, i: int) -> list[Int]:
+    """Indices of the few marks next to one in background, on the darker side and on the lighter one."""
+    offset = background - background[i]
+    others = marks & (np.arange(len(background)) != i)
+    sides = [np.flatnonzero(others & side) for side in (offset <= 0, offset > 0)]
+    return [side[np.argsort(np.abs(offset[side]), kind="stable")[:_BESIDE]] for side in sides]

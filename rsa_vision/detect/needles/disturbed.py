@@ -2,7 +2,7 @@
 
 A fit takes up of whatever lies over a mark the part that looks like a change of its own numbers, and leaves the rest. Both are as smooth
 as blur makes everything on a film, so that what is left of so few frequencies tells how much has been taken up: the variance that a tip
-responds to is that of these frequencies, not that of single pixels, among which a faint wire is lost.
+responds to is that of these frequencies, not that of single pixels, among which a faint wire is lost. What is smoother still is background.
 """
 
 from __future__ import annotations
