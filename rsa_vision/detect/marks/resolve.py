@@ -26,7 +26,7 @@ from rsa_vision.detect.neighbours.lines import without_lines
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.neighbours.spots import Drawn, find_spot, with_spot
 from rsa_vision.detect.search.candidates import Candidates
-from rsa_vision.types import Bool, Float
+from rsa_vision.types import Bool, Float, Int
 
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _COMPANY, _COARSE = 3, 0.6  # peaks beside one that a group may start from; of the radius, from which they are a ball's own
@@ -149,21 +149,27 @@ def resolve_balls(
     if pairs:  # a blob that two balls explain is no ball
         good = good.rows(~_taken(good, join(pairs)) & ~_between(good, pairs))
         groups = groups_worth_fitting()
-    known = good
+    known, there, lone = good, np.ones(len(good.depth), bool), [g[0] for g in groups if len(g) == 1]
     for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
         index = np.array(g)
         if 1 < len(g) <= MOST_IN_GROUP:
             near = all_but(known, index, optics, tees)
-            fits.append(fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, near))
+            group = fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, near)
+            tells = (plausible(group, noise) & ~_cancelled(group)).any()
+            if not tells and (one := _one_for_all(good, index, noise)):
+                there[index] = np.isin(index, one)
+                lone += one
+            else:
+                fits.append(group)
         elif len(g) > MOST_IN_GROUP:
             fits.append(_peel(film, good.rows(index), optics, noise, tees))
-    alone = np.array([g[0] for g in groups if len(g) == 1], dtype=np.intp)
-    if len(alone):
+    if lone:
+        known, alone = good.rows(there), (np.cumsum(there) - 1)[lone]
 
         def neighbours(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
             return images_beside(known, alone[[i]], optics, tees, cols, rows)
 
-        fits.append(fit_at(film, good.position_px[alone], good.radius_px[alone], optics, noise, neighbours))
+        fits.append(fit_at(film, known.position_px[alone], known.radius_px[alone], optics, noise, neighbours))
     found = join([single.rows(slice(0)), *fits])
     found = found.rows(~_cancelled(found))
     found = found.rows(inside(found, film) & ~_taken(found, drawn.fits))
@@ -273,6 +279,13 @@ def _taken(fits: BallFits, good: BallFits) -> Bool:
     """Say which fits lie on a ball that is already known."""
     gap = np.hypot(*(fits.position_px[:, None] - good.position_px[None]).transpose(2, 0, 1))
     return np.asarray((gap < 0.6 * good.radius_px[None]).any(axis=1))
+
+
+def _one_for_all(fits: BallFits, members: Int, noise: NoiseModel) -> list[int]:
+    """Return the one of a group that describes it alone, if there is one: what else began there was its flank, or noise on it."""
+    group = fits.rows(members)
+    close = plausible(group, noise) & (misfit(group, noise, CHANCE) < DOUBTFUL * MISFIT)
+    return [int(members[np.where(close, group.significance, 0.0).argmax()])] if close.any() else []
 
 
 def _between(fits: BallFits, pairs: list[BallFits]) -> Bool:
