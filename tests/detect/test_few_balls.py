@@ -43,7 +43,7 @@ def test_a_few_faint_balls_on_a_plain_film_are_found_and_nothing_else(radius_px:
 
 @pytest.mark.parametrize("seed", [0, 27, 131, 177])
 def test_a_ball_is_not_lost_to_what_began_on_its_flank(seed: int) -> None:
-    """Fitted together with that neither was like a ball, though one alone describes it: five of 200 such films lost theirs."""
+    """Fitted together with that neither was like a ball, though one alone describes it: of seeds up to 200 these lost theirs."""
     rng = np.random.default_rng(seed)
     truth = np.array([[150.0, 160.0]]) + rng.uniform(-20, 20, (1, 2))
     film = film_of_balls((600, 600), truth, np.array([12.0]), depth=DEPTH, sigma_px=4.2, noise_sd=DEPTH * BACKGROUND / 5, rng=rng)

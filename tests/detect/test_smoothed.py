@@ -25,8 +25,9 @@ def median(film: Film) -> NDArray[Any]:
     return np.asarray(cv2.medianBlur(np.rint(film).astype(np.uint16), 5))
 
 
-@pytest.mark.parametrize("smoothed", [bilateral, median])
-def test_errors_are_those_by_the_noise_at_marks(smoothed: Callable[[Film], NDArray[Any]]) -> None:
+# noise goes with the slope after a median filter, not with the value: of 431 balls of 12 films 8 are beyond five, the largest 8.4
+@pytest.mark.parametrize(("smoothed", "beyond"), [(bilateral, 0.0), (median, 0.05)])
+def test_errors_are_those_by_the_noise_at_marks(smoothed: Callable[[Film], NDArray[Any]], beyond: float) -> None:
     """They were 4.7 and 1.9 times too small: what is left beside marks is far less, and smoother."""
     z: list[float] = []
     for seed in range(4):
@@ -41,5 +42,4 @@ def test_errors_are_those_by_the_noise_at_marks(smoothed: Callable[[Film], NDArr
     print(f"{len(z)} balls, error / sd {np.sqrt(np.mean(np.square(z))):.2f}, largest {np.sqrt(2) * max(z):.1f}")
     assert len(z) > 0.95 * 4 * len(balls)
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3
-    # of a median filter noise goes with the slope, not with the value: of 431 balls of 12 films 8 are beyond five, the largest 8.4
-    assert np.mean(np.array(z) > 5 / np.sqrt(2)) < 0.05
+    assert np.mean(np.array(z) > 5 / np.sqrt(2)) <= beyond
