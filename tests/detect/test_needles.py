@@ -94,6 +94,32 @@ def test_the_film_curve_follows_those_of_films(answer: Callable[[Float], Float],
     assert abs(best.x[2]) < 0.4  # a small correction
 
 
+@pytest.mark.parametrize(("late_px", "density"), [(0.29, 1.5), (0.5, 0.8), (0.5, 0.0)])
+def test_what_is_blurred_after_the_film_curve(late_px: float, density: float) -> None:
+    """A scanner's pixel takes the mean of the light, of which density is the logarithm; what is dark then has no say."""
+    curve, early = (-0.8, -0.1), np.sqrt(0.3)
+    line = (np.arange((2 * HALF + 1) * FINE) + 0.5) / FINE - 0.5 - HALF
+    x, y = np.meshgrid(line, line)
+    along, across = x * np.cos(TURN) - y * np.sin(TURN), x * np.sin(TURN) + y * np.cos(TURN)
+    width = SHAPE.half_width_px * np.clip(along / SHAPE.length_px, 0, 1) * (along < SHAPE.length_px)
+    opacity = -np.expm1(-2 * MU * np.sqrt(np.maximum(width**2 - across**2, 0)))
+    logged = np.log(10) * density
+    shown = film_curve(gaussian_filter(opacity, early * FINE), curve)
+    light = gaussian_filter(np.exp(logged * shown) if density else shown, late_px * FINE)
+    image = (np.log(light) / logged if density else light)[FINE // 2 :: FINE, FINE // 2 :: FINE]
+    variance = early**2 + late_px**2
+    rows, cols = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].astype(float)
+
+    def missed(late: float, logged: float) -> float:
+        optics = Optics(float(np.sqrt(variance)), MU, curve=curve, late=late, logged=logged)
+        ours = arm_images(cols.ravel(), rows.ravel(), np.array([TURN]), SHAPE, optics)[0].reshape(rows.shape)
+        return float(np.sqrt(((ours - image) ** 2).sum() / (image**2).sum()))
+
+    right = missed(late_px**2 / variance, logged)
+    assert right < 0.02
+    assert missed(0.0, 0.0) > 1.5 * right
+
+
 def test_derivatives_of_the_film_curve() -> None:
     opacity, step = np.linspace(0.0, 1.0, 21), 1e-5
     slopes = by_film_curve(opacity, (-0.8, 0.2))

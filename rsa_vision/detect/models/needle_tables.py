@@ -68,15 +68,30 @@ def _opacity(
     opacity = np.zeros((n_s, len(p)), np.float32)
     opacity[rows, cols] = (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2]) / 4
 
+    bends = any((*optics.curve, optics.logged))  # if not, it does not matter when it is blurred
+    late = optics.late * (blurrier * optics.sigma_px) ** 2 if bends else 0.0
+    if oblique:  # waves do not draw what is as sharp as a cell
+        late = max(min(late, (1 - math.hypot(along, oblique)) * (blurrier * optics.sigma_px) ** 2 - cell**2), 0.0)
     lights = []  # part of the light, and the variances and covariance of its blur in cells
     for part, sigma in ((1 - optics.tail, blurrier * optics.sigma_px), (optics.tail, TAIL * blurrier * optics.sigma_px)):
         if part:
-            var_s, var_p = (max(by * (sigma / step) ** 2 - _OF_TABLE, 0.1) for by, step in ((1 + along, cell_s), (1 - along, cell_p)))
+            before_s, before_p = ((1 + along) * sigma**2 - late, (1 - along) * sigma**2 - late)
+            var_s, var_p = (max(of / step**2 - _OF_TABLE, 0.1) for of, step in ((before_s, cell_s), (before_p, cell_p)))
             lights.append((part, var_s, var_p, oblique * sigma**2 / (cell_s * cell_p)))
     seen = _obliquely_blurred(opacity, lights) if oblique else _blurred(opacity, lights, mirrored=mirrored)
     if any(optics.curve):
         seen = film_curve(seen, optics.curve).astype(np.float32)
+    if late:
+        seen = _blurred_late(seen, optics.logged, (1.0, late / cell_s**2, late / cell_p**2, 0.0), mirrored=mirrored)
     return np.concatenate([seen[:, :0:-1], seen], axis=1) if mirrored else seen
+
+
+def _blurred_late(shown: Single, logged: float, light: tuple[float, float, float, float], *, mirrored: bool) -> Single:
+    """What film shows after more blur: of itself, or of the light of which it is the logarithm."""
+    if not logged:
+        return _blurred(shown, [light], mirrored=mirrored)
+    blurred = _blurred(np.expm1(np.float32(logged) * shown), [light], mirrored=mirrored)
+    return np.asarray(np.log1p(blurred) / np.float32(logged), np.float32)
 
 
 @lru_cache(maxsize=1024)
@@ -109,19 +124,22 @@ def _obliquely_blurred(image: Single, lights: list[tuple[float, float, float, fl
 def film_curve(opacity: Float | Single, curve: tuple[float, float]) -> Float:
     """What film shows of blurred opacities, by the two coefficients of :attr:`Optics.curve`."""
     shifted = _shifted(opacity, curve[0])
-    return np.asarray(shifted + curve[1] * shifted * (1 - shifted) * (1 - 2 * shifted), np.float64)
+    return np.asarray(shifted + curve[1] * shifted * (1 - shifted) * (1 - 2 * shifted))
 
 
 def by_film_curve(opacity: Float | Single, curve: tuple[float, float]) -> list[Float]:
-    """Derivatives of what film shows by the two coefficients of its curve."""
+    """Derivatives of what film shows by the two coefficients of its curve, whatever is blurred after it."""
     shifted = _shifted(opacity, curve[0])
     bow = shifted * (1 - shifted)
     return [bow * (1 + curve[1] * (1 - 6 * bow)), bow * (1 - 2 * shifted)]
 
 
 def _shifted(opacity: Float | Single, by: float) -> Float:
-    """Opacities whose log odds are by so much more."""
-    return np.asarray(opacity / (opacity + math.exp(-by) * (1 - opacity)), np.float64)
+    """Opacities whose log odds are by so much more; those of overshoots, which have none, go on straight."""
+    within = np.asarray(np.clip(opacity, 0.0, 1.0), np.float64)
+    beyond = opacity - within
+    factor = math.exp(by)
+    return np.asarray(within / (within + (1 - within) / factor) + beyond * np.where(beyond < 0, factor, 1 / factor))
 
 
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:
@@ -145,7 +163,7 @@ def table_for(
     first, (n_s, n_p) = _grid(half_width, length, sigma)
     middle, rim = ((n_s - 1) / 2, (n_p - 1) / 2), (_PAD - _FADED) * sigma / cell_of(sigma)
     curve = round(optics.curve[0], 3), round(optics.curve[1], 3)
-    near = Optics(sigma, round(optics.mu_px, 4), curve, round(optics.tail, 3))
+    near = Optics(sigma, round(optics.mu_px, 4), curve, round(optics.tail, 3), round(optics.late, 3), round(optics.logged, 2))
     return (half_width, length, round(taper, 3), near), first, middle, (middle[0] - rim, middle[1] - rim)
 
 
@@ -154,7 +172,7 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
     """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
     ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur, by
-    the taper, by the curve, by the tail and by what is uneven, alone.
+    the taper, by the curve, by the tail, by what is late and logged and by what is uneven, alone.
     """
     one = half_width, length, taper, optics, slant
     base = _opacity(*one)
@@ -170,15 +188,17 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
         factor = float(np.exp(STEP))
         dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
         wide, short = _opacity(*one, blurrier=factor), _opacity(half_width, length, taper - STEP, optics, slant)
-        straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0)), slant)
-        spread = _opacity(half_width, length, taper, replace(optics, tail=optics.tail + STEP), slant)
-        by_curve = by_film_curve(straight, optics.curve)
-        uneven = [
-            _opacity(half_width, length, taper, replace(optics, uneven=(optics.uneven[0] + along, optics.uneven[1] + oblique)), slant)
-            for along, oblique in ((STEP, 0.0), (0.0, STEP))
+        along, oblique = optics.uneven
+        others = [
+            replace(optics, tail=optics.tail + STEP),
+            replace(optics, late=optics.late + STEP),
+            replace(optics, logged=optics.logged + STEP),
+            replace(optics, uneven=(along + STEP, oblique)),
+            replace(optics, uneven=(along, oblique + STEP)),
         ]
-        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *by_curve]
-        nodes += [(more - base) / STEP for more in (spread, *uneven)]
+        straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0), logged=0.0), slant)
+        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *by_film_curve(straight, optics.curve)]
+        nodes += [(_opacity(half_width, length, taper, other, slant) - base) / STEP for other in others]
     values = np.array(nodes, np.float32)
     values[:, [0, -1]] = values[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return values

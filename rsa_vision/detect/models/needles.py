@@ -149,7 +149,7 @@ def arm_images(
 def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> Float:
     """Derivatives of every arm by all of an :class:`Optics`, on the first axis; how the ends slant hardly matters.
 
-    In order: logarithms of attenuation and blur, taper, the two of the curve, tail, the two of what is uneven.
+    In order: logarithms of attenuation and blur, taper, the two of the curve, tail, late, logged, the two of what is uneven.
     """
     seen = _Seen.of(dx, dy, angles, shape, optics)
     *rows, by_along, by_oblique = seen.looked_up("optics", [0.0] * len(angles))

@@ -39,6 +39,11 @@ class Optics:
         ``g`` are those of ``o`` plus ``curve[0]``. Negative where film answers more the more of its light is gone, as density does.
     tail : float
         Part of the light that is spread ``TAIL`` times as far as the rest: of screens, scanners and scatter nearby.
+    late : float
+        Part of the variance of the blur that comes after the film curve: of the scanner's pixel, where there is a scanner. Pins and tees.
+    logged : float
+        Logarithm of the light at full opacity over that of the background, where a film shows the logarithm of the light that is blurred
+        late, as density is; zero where it shows the light. Pins and tees.
     proportion : float
         Change of a needle's depth with the background along it, both in film values: on a film that is linear in exposure a mark takes away
         a part of what is there, on a logarithmic one always the same.
@@ -53,6 +58,8 @@ class Optics:
     mu_px: float
     curve: tuple[float, float] = (0.0, 0.0)
     tail: float = 0.0
+    late: float = 0.0
+    logged: float = 0.0
     proportion: float = 0.0
     uneven: tuple[float, float] = (0.0, 0.0)
     rough: bool = False

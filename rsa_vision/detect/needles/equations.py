@@ -16,9 +16,9 @@ from rsa_vision.detect.needles.crossing import Window, gain_at, lapping
 from rsa_vision.detect.needles.irregular import ARMS, OF_STRETCH, WAYS, Regularity, ways_of
 from rsa_vision.types import Float, Int
 
-# common to all: attenuation, blur, taper, curve (2), tail, uneven (2); then logarithms of half width and length; then directions
-BENT, UNEVEN = slice(3, 8), slice(6, 8)
-OPTICS, SHARED = 8, 10
+# common to all: attenuation, blur, taper, curve (2), tail, late, logged, uneven (2); logarithms of half width and length; directions
+BENT, UNEVEN = slice(3, 10), slice(8, 10)
+OPTICS, SHARED = 10, 12
 OWN = 5  # tip (2), half width, length, blur; then directions, slants, and how arms differ
 _BLUR = 1  # place of its logarithm in what is common
 SLANT, SKEW = 0.11, 0.08  # root mean squares, of a square and a product of slopes: rays cross a film at slopes of up to a half
@@ -292,6 +292,6 @@ def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
 
 
 def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
-    """Derivatives of each member's arms by what is common, shape (8, k, n), as of :func:`arms_by_optics`."""
+    """Derivatives of each member's arms by what is common, shape (10, k, n), as of :func:`arms_by_optics`."""
     offsets = [(window.cols - f.position_px[0], window.rows - f.position_px[1]) for f in members]
     return [arms_by_optics(*at, f.angles, f.shape, f.seen_by(optics)) for at, f in zip(offsets, members, strict=True)]

@@ -39,8 +39,8 @@ _OTHER_BLURS_PX = BLURS_PX[1::2]  # of pins on films whose balls have another
 _KNOWN = 0.12  # of its length, to which the tip of a pin is known even at CNR 5: trabeculae are pointed anyhow
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
-# errors along a pin over its length, by the fourth power of the curve, by it and the logarithm of the depth, by the others
-_OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.01, 0.05, 0.03, 2.0
+# errors along a pin over its length, by the third power of the curve, by it and the logarithm of the depth, by the others
+_OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.015, 0.05, 0.03, 2.0
 _SAMPLE = 6
 _MOST_ASKED = 18  # for the optics that they have in common
 
@@ -233,7 +233,9 @@ def _less_sure_along(fit: NeedleFit, typical: float, odd_px: float, optics: Opti
     by_rest = _OF_MISFIT * significant_misfit(fit, noise) / np.sqrt(excess_of(fit, noise))  # by that the table widens all of it
     # where film responds more or less than usual, it is bent more or less as well
     unlike = abs(math.log(fit.depth / typical))
-    by_model = np.array([_OF_CURVE * optics.curve[0] ** 4, _OF_UNLIKE * optics.curve[0] * unlike, _OF_TAIL * optics.tail, by_rest])
+    bend = optics.curve[0]
+    by_curve = [_OF_CURVE * bend**3, _OF_UNLIKE * bend * unlike]
+    by_model = np.array([*by_curve, _OF_TAIL * optics.tail, by_rest])
     parts = [odd_px, _POINT * fit.shape.half_width_px, *(fit.shape.length_px * by_model)]
     error_px = float(np.linalg.norm(parts))
     way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])

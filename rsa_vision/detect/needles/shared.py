@@ -52,14 +52,17 @@ _BLURS_AFTER, _MORE_STEPS = 3, 6
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
-_CURVE_ERROR, _TAIL_ERROR = (0.6, 0.1), 0.07
+_CURVE_ERROR, _CURVE_OF_PINS_ERROR, _TAIL_ERROR = (0.6, 0.1), (1.0, 0.1), 0.07
+_ENOUGH_PINS = 3  # that tell what comes after the film curve
+_PIXEL, _MOST_PIXEL = 1 / 12, 0.5  # px^2 of blur by the area of a scanner's pixel, and part of the variance that it may be at first
+_LATE_ERROR, _LOGGED_ERROR, _FIXED = 0.15, 2.5, 1e-3  # of what comes after the film curve, of the logarithm there, of either where it stays
 # of what is uneven of the blur: of a first estimate, and where that, or the needles as a whole, have told something of it
 _EVEN_ERROR, _UNEVEN_ERROR = 0.02, 0.2
 _OF_UNEVEN = np.eye(2) / _UNEVEN_ERROR**2
 _BY_CHANCE = 14.0  # chi2 of two degrees of freedom
-# of attenuation, blur, taper, curve, tail, uneven: changes from which derivatives by them are taken anew
-_MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1, 0.1, 0.1])
-_NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.1])  # changes of those with which the last step gets there
+# of attenuation, blur, taper, curve, tail, late, logged, uneven: changes from which derivatives by them are taken anew
+_MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1, 0.1, 0.5, 0.1, 0.1])
+_NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.5, 0.1, 0.1])  # changes of those with which the last step gets there
 _SHORTER = 3  # attempts at a step that loses nothing
 # side of squares than which all that is slower is left out, on bone; near enough the best for arms of half widths of 2.5 to 4
 _SQUARE_PX = 17
@@ -91,7 +94,9 @@ def fit_shared(
     parallel : bool
         The arms of all needles have the same directions against their first; else each arm its own.
     alike : bool
-        Their sizes differ as little as fits with free sizes show: for pins, whose tips depend on where they end.
+        Their sizes differ as little as fits with free sizes show: for pins, whose tips depend on where they end. Three of them or more tell
+        what comes after the film curve as well, which moves no tip that three arms hold; before it is known that there are pins, rods may
+        be bent into them.
     steps : int
         At the most.
 
@@ -108,11 +113,19 @@ def fit_shared(
     windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
     windows = [w.with_edge(m, optics) if any(f.edged for f in m) else w for w, m in zip(windows, sets, strict=True)]
     of_blur = _UNEVEN_ERROR if any(optics.uneven) else _EVEN_ERROR
-    errors = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *_CURVE_ERROR, _TAIL_ERROR, of_blur, of_blur, _SIZE_ERROR, _SIZE_ERROR]
+    scanned = alike and len(needles) >= _ENOUGH_PINS
+    of_scanner = [_LATE_ERROR, _LOGGED_ERROR] if scanned else [_FIXED, _FIXED]
+    if not scanned:
+        optics = replace(optics, late=0.0, logged=0.0)
+    elif not optics.late:
+        optics = replace(optics, late=min(_PIXEL / optics.sigma_px**2, _MOST_PIXEL))
+    of_curve = _CURVE_OF_PINS_ERROR if scanned else _CURVE_ERROR
+    of_beam = [_ATTENUATION_ERROR, _BLUR_ERROR, _TAPER_ERROR, *of_curve, _TAIL_ERROR]
+    errors = [*of_beam, *of_scanner, of_blur, of_blur, _SIZE_ERROR, _SIZE_ERROR]
     precision = np.diag(np.array(errors + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     # steps weigh pixels as if noise were white, and believe them the more the more neighbours share of it
     gain = float(noise.gain(np.hypot(optics.sigma_px, np.median([f.shape.half_width_px for f in needles]))))
-    held = precision * gain
+    held, n_free = precision * gain, len(precision) - len(of_scanner) * (not scanned)
     sizes = Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     arms = regular(sets) if len(needles[0].angles) == ARMS else None
     at = State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, equal(sets), arms)
@@ -132,7 +145,7 @@ def fit_shared(
             for w, m, k, expected, e in zip(windows, at.sets, slopes, at.expected, last, strict=True)
         ]
         cost = sum(e.cost for e in systems) + float(at.moved @ held @ at.moved)
-        if before and cost > least + len(held) and shorter < _SHORTER and count < steps:
+        if before and cost > least + n_free and shorter < _SHORTER and count < steps:
             at, systems, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
             step, shorter, converged = step.shorter(), shorter + 1, False
         else:
@@ -147,7 +160,7 @@ def fit_shared(
             if count == steps or converged:
                 break
             least, shorter = cost, 0
-            change = change_of(normal, target - held @ at.moved, at.taper)
+            change = change_of(normal, target - held @ at.moved, at, start)
             if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
                 change[:OPTICS] = 0.0  # new tables for so little are not worth their time
             far = float(change @ normal @ change) / len(change)
@@ -159,7 +172,9 @@ def fit_shared(
                 asked_of_blurs = True
                 if differ := _blurs(systems, gain):
                     moved = at.moved.copy()
-                    moved[BENT] = [-was for was in (*start.curve, start.tail, *start.uneven)]  # a curve that made up for them leads astray
+                    moved[BENT] = [
+                        -was for was in (*start.curve, start.tail, 0.0, start.logged, *start.uneven)
+                    ]  # a curve that made up for them leads astray
                     at, converged, least, before = (
                         replace(at, sets=differ[0], blurs=differ[1], moved=moved, sizes=sizes),
                         False,
@@ -187,7 +202,7 @@ def fit_shared(
     systems = [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
     told = [e.information() for e in compress(systems, telling)]
     normal = precision + sum(matrix for matrix, _ in told)
-    change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at.taper)
+    change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at, start)
     step = Step(change, [e.step(change) for e in systems])
     at = at.after(step, systems, parallel)
     optics = moved_optics(start, at.moved)

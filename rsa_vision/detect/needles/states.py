@@ -19,8 +19,10 @@ from rsa_vision.types import Float
 
 _LEAST_TAPER = 0.1
 _MOST = 3.0, 0.8, 0.6  # curve and tail
+_MOST_LATE, _MOST_LOGGED = 0.6, 3.0
 _MOST_UNEVEN = 0.8
-_MOST_BY_STEP, _MOST_TAPER_BY_STEP = 0.6, 0.2  # of all these
+_TAPER, _LATE, _LOGGED = 2, 6, 7  # places of these in what is common
+_MOST_BY_STEP, _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP = 0.6, 0.2, 2.0
 _BLURRIER_BY_STEP = 0.2  # by a step, of one needle's
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
@@ -99,7 +101,7 @@ class State:
 
     def after(self, step: Step, systems: list[Equations], parallel: bool) -> State:
         """Return where a step leads from where these equations hold."""
-        taper = self.taper + float(step.change[2])
+        taper = self.taper + float(step.change[_TAPER])
         sets = [_moved(e.members, own, step.change, taper, parallel) for e, own in zip(systems, step.own, strict=True)]
         sizes = replace(self.sizes, typical=self.sizes.typical + step.change[OPTICS:SHARED])
         known = self.regularity
@@ -124,34 +126,48 @@ def of_usual_size(sets: list[list[NeedleFit]]) -> list[list[NeedleFit]]:
     return [[replace(f, shape=replace(f.shape, half_width_px=width, length_px=length)) for f in members] for members in sets]
 
 
-def change_of(normal: Float, target: Float, taper: float) -> Float:
-    """Change of the common parameters, not too far at once; the taper stays within its bounds, the others follow."""
+def change_of(normal: Float, target: Float, at: State, start: Optics) -> Float:
+    """Change of the common parameters, not too far at once; what has bounds stays within them, the others follow.
+
+    ``start``: from which ``at`` has moved.
+    """
+    least, most = np.full((2, len(target)), np.array([[-np.inf], [np.inf]]))
+    for k, now, low, high in (
+        (_TAPER, at.taper, _LEAST_TAPER, 1.0),
+        (_LATE, start.late + at.moved[_LATE], 0.0, _MOST_LATE),
+        (_LOGGED, start.logged + at.moved[_LOGGED], 0.0, _MOST_LOGGED),
+    ):
+        least[k], most[k] = low - now, high - now
     change = np.linalg.solve(normal, target).astype(np.float64)
     change *= _as_far(change)
-    held = between(change[2], _LEAST_TAPER - taper, 1.0 - taper)
-    if held != change[2]:
-        others = np.arange(len(change)) != 2
-        change[others] = np.linalg.solve(normal[np.ix_(others, others)], target[others] - normal[others, 2] * held)
-        change[2] = held
+    held = (change < least) | (change > most)
+    if held.any():
+        change[held] = np.clip(change, least, most)[held]
+        others = ~held
+        change[others] = np.linalg.solve(normal[np.ix_(others, others)], target[others] - normal[np.ix_(others, held)] @ change[held])
         change *= _as_far(change)
-    return change
+    return np.clip(change, least, most)
 
 
 def _as_far(change: Float) -> float:
     """Part of a change that one step may go."""
-    return float(min(1.0, _MOST_BY_STEP / max(float(np.abs(change).max()), 1e-9), _MOST_TAPER_BY_STEP / max(abs(change[2]), 1e-9)))
+    most = np.full(len(change), _MOST_BY_STEP)
+    most[[_TAPER, _LOGGED]] = _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP
+    return float(min(1.0, 1.0 / max(float((np.abs(change) / most).max()), 1e-9)))
 
 
 def moved_optics(start: Optics, by: Float) -> Optics:
-    """Optics with these changes of the logarithms of attenuation and blur, of curve, tail and what is uneven."""
+    """Optics with these changes of the logarithms of attenuation and blur, of curve, tail, what is late, logged and what is uneven."""
     bow, skewed, tail = (
         between(was + step, -most, most) for was, step, most in zip((*start.curve, start.tail), by[3:6], _MOST, strict=True)
     )
+    late, logged = between(start.late + by[_LATE], 0.0, _MOST_LATE), between(start.logged + by[_LOGGED], 0.0, _MOST_LOGGED)
     dense, blurred = np.exp(by[:2]).tolist()
     along, oblique = start.uneven + by[UNEVEN]
     part = min(1.0, _MOST_UNEVEN / max(float(np.hypot(along, oblique)), 1e-9))
     uneven = (float(along * part), float(oblique * part))
-    return replace(start, mu_px=start.mu_px * dense, sigma_px=start.sigma_px * blurred, curve=(bow, skewed), tail=tail, uneven=uneven)
+    mu, sigma = start.mu_px * dense, start.sigma_px * blurred
+    return replace(start, mu_px=mu, sigma_px=sigma, curve=(bow, skewed), tail=tail, late=late, logged=logged, uneven=uneven)
 
 
 def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> list[NeedleFit]:
