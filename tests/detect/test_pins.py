@@ -11,6 +11,7 @@ from rsa_vision.detect import detect_markers
 from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.fits import fit_needles
 from rsa_vision.detect.needles.pointed import is_pin
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.flags import MarkerFlag
@@ -35,10 +36,11 @@ def film_of_pins(
     tail: float = 0.0,
     unevenly: float = 1.0,
     penumbra_px: float = 0.0,
+    longer: float = 1.0,
 ) -> tuple[np.ndarray, Float, Float]:
     """Sixteen pins of 0.5 x 2 mm in all directions, exact chords; tips and directions away from them, both (n, 2), (col, row).
 
-    Every third is ``smaller`` by that factor. ``response``: ``density``, of film with half as much scattered light. ``tail``: part of the
+    Every third is ``smaller`` by that factor; they are up to ``longer`` times as long as their widths have it. ``response``: ``density``, of film with half as much scattered light. ``tail``: part of the
     light that is spread four times as far. ``unevenly``: so many times as far along columns as along rows.
     ``penumbra_px``: blur that every second pin has besides.
     """
@@ -55,7 +57,8 @@ def film_of_pins(
         x, y = np.meshgrid(line + corner[0] - tip[0], line + corner[1] - tip[1])
         lean = slope * rng.uniform(-1, 1, 2) if slope else np.zeros(2)  # of the rays, along columns and rows
         origin, down = np.array([x * PITCH_MM, y * PITCH_MM, 0 * x]), np.array([0 * x + lean[0], 0 * x + lean[1], 0 * x + 1])
-        chord = chord_pin(origin, down, np.zeros(3), np.array([*way, 0.0]), 2.0 * size, 0.25 * size, taper)
+        length = 2.0 * size * (rng.uniform(1 / longer, longer) if longer > 1 else 1.0)
+        chord = chord_pin(origin, down, np.zeros(3), np.array([*way, 0.0]), length, 0.25 * size, taper)
         left = np.exp(-MU_PER_MM * chord).reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
         clear[len(tips) % 2, corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= left
         tips.append(tip)
@@ -242,6 +245,26 @@ def test_steeply_bent_curves_hide_no_pins() -> None:
     stated = np.einsum("ni,nij,nj->n", ways[nearest], found.covariance_px2, ways[nearest])
     print(f"{len(found)} found, RMS {np.sqrt(np.mean(missed**2)):.2f} px, error / stated {np.sqrt(np.mean(missed**2 / stated)):.2f}")
     assert np.max(missed**2 / stated) < 4.0**2
+
+
+@pytest.mark.parametrize("length_px", [7.0, 11.0])
+def test_a_fit_that_begins_too_short_ends_where_its_pin_does(length_px: float) -> None:
+    """It saw no more than the surroundings of its start: ends beyond those lay at their rims, 2 to 4 px short."""
+    film, tips, ways = film_of_pins(np.random.default_rng(0), taper=1.0)
+    noise, optics = estimate_noise(film, 16), Optics(np.sqrt(SIGMA_PX**2 + 1 / 12), 0.8)
+    for tip, way in zip(tips, ways, strict=True):
+        start = NeedleShape(2.5, length_px, 0.5)
+        fit = fit_needles(film.astype(np.float32), tip + way, np.array([np.arctan2(-way[1], way[0])]), start, optics, noise)
+        assert abs(fit.shape.length_px - 20) < 0.7
+
+
+def test_pins_of_several_lengths_are_found() -> None:
+    """As the strokes that they began from had been too short, rods seemed better: a third of them were lost."""
+    film, tips, _ = film_of_pins(np.random.default_rng(0), taper=0.9, quanta=QUANTA / 10, longer=1.3)
+    images = detect_markers(film, bits=16).images
+    pins = images.rows(images.shape == "pin")
+    assert len(pins) == len(tips)
+    assert (np.hypot(*(pins.position_px[:, None] - tips).transpose(2, 0, 1)).min(axis=0) < 3).all()
 
 
 def test_one_speck_does_not_tell_the_blur_of_a_film_of_pins() -> None:

@@ -20,6 +20,8 @@ _STEPS = 14
 _DEEPER = 2.0  # times the height of an image: a depth beyond that is what thin opacity would come to, and no measure
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
 _CLOSE_PX = 0.1
+_SPARE_PX = 4.0  # beyond which a start's surroundings are not looked at
+_GROWS, _WORTH = 3, 0.8  # times that a fit which has grown out of these begins again, and what it must explain of what it saw
 _MOVES = 5  # tip, half width, length, direction
 _UNDER = 0.08  # of the height of an image, from which a pixel lies under it
 PROMISING = 0.4  # of what lies under a start, that it must explain for a quick fit to go on
@@ -61,12 +63,40 @@ def fit_needles(
     -------
     NeedleFit
     """
+    fit = _fitted(film, tip_px, angles, shape, optics, noise, quick=quick, sized=sized)
+    start = tip_px, shape
+    for _ in range(0 if quick else _GROWS):
+        if fit.explained < _WORTH or not _outgrown(fit, *start):
+            break
+        start = fit.position_px, fit.shape
+        fit = _fitted(film, fit.position_px, fit.angles, fit.shape, optics, noise, quick=False, sized=sized)
+    return fit
+
+
+def _outgrown(fit: NeedleFit, tip_px: Float, shape: NeedleShape) -> bool:
+    """Say whether a fit ends where the pixels around its start no longer show what lies beyond."""
+    at_tip = (fit.position_px - tip_px) @ np.array([np.cos(fit.angles), -np.sin(fit.angles)])
+    return bool(max(-at_tip.min(), at_tip.max() + fit.shape.length_px - shape.length_px) > _SPARE_PX / 2)
+
+
+def _fitted(
+    film: NDArray[Any],
+    tip_px: Float,
+    angles: Float,
+    shape: NeedleShape,
+    optics: Optics,
+    noise: NoiseModel,
+    *,
+    quick: bool,
+    sized: bool,
+) -> NeedleFit:
+    """Fit to the pixels around the start."""
     half = int(np.ceil(shape.length_px * 1.15 + shape.half_width_px + 3 * optics.sigma_px + 3))
     whole = cut(film, tip_px[None], half, noise)
     patch = apart_from_repairs(whole, noise)
     corner = patch.corner_px[0].astype(np.float64)
     axis = np.arange(float(patch.size))
-    margin = 3 * optics.sigma_px + (1.0 if quick else 4.0)
+    margin = 3 * optics.sigma_px + (1.0 if quick else _SPARE_PX)
     near = support(axis + (corner[0] - tip_px[0]), axis + (corner[1] - tip_px[1]), angles, shape, margin)
     rows, cols = np.nonzero(near & patch.valid[0])
     data = patch.values[0][rows, cols]

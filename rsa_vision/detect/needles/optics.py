@@ -16,7 +16,7 @@ _SAMPLE = 18  # arms that are asked
 _STEPS = 4  # for a first estimate
 
 
-def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> Optics:
+def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise: NoiseModel) -> tuple[Optics, float]:
     """Estimate what the images of the cleanest needles have in common.
 
     Parameters
@@ -30,9 +30,12 @@ def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, 
 
     Returns
     -------
-    Optics
+    optics : Optics
+    taper : float
+        Part of their length over which they taper.
     """
     alone = [c[0] for c in clusters(needles) if len(c) == 1] or needles
     sample = sorted(alone, key=lambda f: f.misfit)
     sample = sample[: _SAMPLE // len(sample[0].angles)]
-    return fit_shared(film, sample, optics, noise, parallel=False, steps=_STEPS)[1]
+    fits, optics = fit_shared(film, sample, optics, noise, parallel=False, steps=_STEPS)
+    return optics, fits[0].shape.taper

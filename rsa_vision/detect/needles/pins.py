@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -41,6 +42,7 @@ _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth o
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length, by the third power of the curve, by it and the logarithm of the depth, by the others
 _OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.015, 0.05, 0.03, 2.0
+_NO_OTHER = 0.15  # from a usual taper: the last fit gets there itself
 _SAMPLE = 6
 _MOST_ASKED = 18  # for the optics that they have in common
 
@@ -102,8 +104,9 @@ def _found_from(
         return [], known
     optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
     more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
-    optics = common_optics(film, [f for f in sample + more if is_pin(f, noise)], optics, noise)
-    _, taper, sample = _likeliest(film, [f for f in sample if is_pin(f, noise)], [optics], noise)  # a wide blur feigns a short point
+    optics, told = common_optics(film, [f for f in sample + more if is_pin(f, noise)], optics, noise)
+    tapers = TAPERS if min(abs(told - t) for t in TAPERS) < _NO_OTHER else sorted([*TAPERS, told], reverse=True)
+    _, taper, sample = _likeliest(film, [f for f in sample if is_pin(f, noise)], [optics], noise, tapers)  # a wide blur feigns a short point
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
     even = replace(optics, uneven=(0.0, 0.0))  # which way of those is the best does not hang on that, and it takes a table for each angle
@@ -151,9 +154,9 @@ def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel
 
 
 def _likeliest(
-    film: NDArray[Any], sample: list[NeedleFit], trials: list[Optics], noise: NoiseModel
+    film: NDArray[Any], sample: list[NeedleFit], trials: list[Optics], noise: NoiseModel, tapers: Sequence[float] = TAPERS
 ) -> tuple[Optics, float, list[NeedleFit]]:
-    """Choose of these optics and of all tapers those with which pins leave least, each of them on the same pixels.
+    """Choose of these optics and tapers those with which pins leave least, each of them on the same pixels.
 
     What no pin explains has a say that is bounded.
     """
@@ -169,7 +172,7 @@ def _likeliest(
 
     for optics in trials:
         tried, last = sample, None
-        for taper in TAPERS:  # each from the one before: a cone is longer than the pin with a short point that it stands for
+        for taper in tapers:  # each from the one before: a cone is longer than the pin with a short point that it stands for
             tried = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in tried]
             left = np.array([chi2_of(window, f, optics, noise) for window, f in zip(windows, tried, strict=True)])
             fits[optics, taper], chi2[optics, taper] = tried, left

@@ -105,7 +105,7 @@ def _found_from(
     if under := _outshone(film, tees, models[0], optics, noise):
         tees = _distinct(fit_all(film, [*tees, *under], optics, noise, again=MOST_TOGETHER), models[0])
     if optics.rough:  # where arms cross hardly depends on where they end; with a wrong blur one tee leaves what two explain
-        optics = common_optics(film, tees, optics, noise)
+        optics, _ = common_optics(film, tees, optics, noise)
         tees = fit_all(film, tees, optics, noise)
     around = tees
 
