@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.needles.penumbra import differing
+from rsa_vision.detect.needles.differing import MOST_BLURRIER, differing
 from rsa_vision.types import Float
 
 from .test_covered import CELLS, exposed, light_past_tees, tips_of
@@ -57,11 +57,11 @@ def test_only_what_is_more_than_chance_is_a_difference(spread: float) -> None:
     for seed in range(50):
         rng = np.random.default_rng(seed)
         blurs = [rng.normal(0.3, np.hypot(spread, 0.03), 1) for _ in range(16)]
-        if (found := differing(blurs, [np.full(1, 0.03**2)] * 16)) is not None:
+        if (found := differing(blurs, [np.full(1, 0.03**2)] * 16, MOST_BLURRIER)) is not None:
             told += 1
             assert not spread or (0.4 * spread < np.median(found.spread) < 2 * spread and abs(found.typical - 0.3) < spread)
     assert (told < 3) if spread == 0 else (told == 50)
 
 
 def test_few_needles_tell_nothing_of_blurs() -> None:
-    assert differing([np.array([-0.3]), np.array([0.3])], [np.array([1e-4])] * 2) is None
+    assert differing([np.array([-0.3]), np.array([0.3])], [np.array([1e-4])] * 2, MOST_BLURRIER) is None

@@ -40,7 +40,8 @@ def film_of_pins(
 ) -> tuple[np.ndarray, Float, Float]:
     """Sixteen pins of 0.5 x 2 mm in all directions, exact chords; tips and directions away from them, both (n, 2), (col, row).
 
-    Every third is ``smaller`` by that factor; they are up to ``longer`` times as long as their widths have it. ``response``: ``density``, of film with half as much scattered light. ``tail``: part of the
+    Every third is ``smaller`` by that factor; they are up to ``longer`` times as long as their widths have it.
+    ``response``: ``density``, of film with half as much scattered light. ``tail``: part of the
     light that is spread four times as far. ``unevenly``: so many times as far along columns as along rows.
     ``penumbra_px``: blur that every second pin has besides.
     """
@@ -265,6 +266,23 @@ def test_pins_of_several_lengths_are_found() -> None:
     pins = images.rows(images.shape == "pin")
     assert len(pins) == len(tips)
     assert (np.hypot(*(pins.position_px[:, None] - tips).transpose(2, 0, 1)).min(axis=0) < 3).all()
+
+
+@pytest.mark.parametrize("quanta", [QUANTA / 10, QUANTA])
+def test_pins_with_tapers_of_their_own_are_where_they_are_said_to_be(quanta: float) -> None:
+    """Points of one angle on pins of several lengths: one taper for all left tips up to ten stated errors off."""
+    rng, squares = np.random.default_rng(100), []
+    for _ in range(2):
+        film, tips, _ = film_of_pins(rng, taper=0.9, quanta=quanta, longer=1.3)
+        images = detect_markers(film, bits=16).images
+        pins = images.rows((images.shape == "pin") & (images.flags == 0))
+        assert len(pins) > 10
+        off = pins.position_px[:, None] - tips
+        nearest = np.hypot(*off.transpose(2, 0, 1)).argmin(axis=1)
+        errors = off[np.arange(len(pins)), nearest]
+        squares += np.einsum("ni,ni->n", errors, np.linalg.solve(pins.covariance_px2, errors[:, :, None])[:, :, 0]).tolist()
+    assert max(squares) < 20
+    assert 0.7 < np.sqrt(np.mean(squares) / 2) < 1.6  # all pins of a film share some of it
 
 
 def test_one_speck_does_not_tell_the_blur_of_a_film_of_pins() -> None:

@@ -22,7 +22,7 @@ EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters le
 SIGNIFICANT, _CHANCE = 9.0, 2.0  # and standard deviations of what noise leaves under a pin
 SURER_THAN_ROD = 12.0  # half the chi2 by which a rod must be worse
 _ALONE = 5.0  # standard deviations of one pixel: lower ones, of which there are fewer, may be anything as long
-_ALONE_SLIM = 5.5  # length over half the width: nearer to that of two balls side by side
+_SLENDER = 8.0  # length over half the width, of Selvik's pins
 _RATHER_THAN_ROD, RATHER_THAN_TURNED, _ONE_WAY = 2.5, 7.0, 2.5  # the last for what has been told from a rod already
 _OF_LEFT = 0.5  # of the chi2 that a fit leaves beyond noise, by which the same the other way round must be worse
 _ROD = 0.02  # taper of a rod: blunt
@@ -88,9 +88,9 @@ def _about_as_long(fit: NeedleFit, typical_px: float) -> bool:
 
 
 def shows_its_form(pin: NeedleFit, noise: NoiseModel) -> bool:
-    """Say whether no noise hides the form of a pin, and it has one: one without company has nothing else that tells what it is."""
-    stubby = pin.shape.length_px < _ALONE_SLIM * pin.shape.half_width_px
-    return not stubby and pin.height > _ALONE * float(np.sqrt(noise.variance_at(np.array(pin.background))))
+    """Say whether no noise hides the form of a pin, which a shorter one has less of: without company nothing else tells what it is."""
+    shorter = max(_SLENDER * pin.shape.half_width_px / pin.shape.length_px, 1.0)
+    return pin.height > _ALONE * shorter * float(np.sqrt(noise.variance_at(np.array(pin.background))))
 
 
 def points_one_way(film: NDArray[Any], fit: NeedleFit, others: Images | None, optics: Optics, noise: NoiseModel) -> bool:

@@ -20,10 +20,12 @@ from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window, window_of
+from rsa_vision.detect.needles.differing import MOST_BLURRIER, MOST_TAPER, Differing, differing, equal
 from rsa_vision.detect.needles.disturbed import louder
 from rsa_vision.detect.needles.equations import (
     BENT,
     OPTICS,
+    TAPER,
     UNEVEN,
     Equations,
     by_optics,
@@ -32,10 +34,8 @@ from rsa_vision.detect.needles.equations import (
 from rsa_vision.detect.needles.fits import between, excess_of, scored
 from rsa_vision.detect.needles.grounds import errors_by_ground
 from rsa_vision.detect.needles.irregular import ARMS, Regularity, regular, told_by
-from rsa_vision.detect.needles.penumbra import MOST as MOST_BLURRIER
-from rsa_vision.detect.needles.penumbra import Blurs, differing, equal
 from rsa_vision.detect.needles.sets import beside_each, clusters
-from rsa_vision.detect.needles.states import Sizes, State, Step, change_of, moved_optics, of_usual_size, sizes_of
+from rsa_vision.detect.needles.states import LEAST_TAPER, Sizes, State, Step, change_of, moved_optics, of_usual_size, sizes_of
 from rsa_vision.types import Float
 
 _STEPS = 12
@@ -48,7 +48,7 @@ _TAPER_ERROR = 0.1
 _SPOILT = 1.5  # times the chi2 of most pins: what leaves so much, on bone, tells nothing of what they have in common
 _SIZE_ERROR = 1.0  # of those, before
 _ASKED_AFTER = 4  # steps, after which it is asked at the latest how far arms and blurs differ: what differs does not converge
-_BLURS_AFTER, _MORE_STEPS = 3, 6
+_BLURS_AFTER, _TAPERS_AFTER, _MORE_STEPS = 3, 5, 6
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
@@ -109,7 +109,8 @@ def fit_shared(
     if not needles:
         return [], optics
     parallel = parallel and len(needles[0].angles) > 1
-    sets = clusters(needles)
+    taper = float(np.median([f.shape.taper for f in needles]))
+    sets = clusters([replace(f, shape=replace(f.shape, taper=taper)) for f in needles])
     windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
     windows = [w.with_edge(m, optics) if any(f.edged for f in m) else w for w, m in zip(windows, sets, strict=True)]
     of_blur = _UNEVEN_ERROR if any(optics.uneven) else _EVEN_ERROR
@@ -128,18 +129,18 @@ def fit_shared(
     held, n_free = precision * gain, len(precision) - len(of_scanner) * (not scanned)
     sizes = Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     arms = regular(sets) if len(needles[0].angles) == ARMS else None
-    at = State(sets, np.zeros(len(precision)), needles[0].shape.taper, sizes, equal(sets), arms)
+    at = State(sets, np.zeros(len(precision)), taper, sizes, equal(sets), equal(sets), arms)
     telling = _telling(sets, noise) if alike else [True] * len(sets)
-    asked, asked_of_blurs, sizes_at = False, False, _SIZES_AFTER
-    start, slopes, since, of_blurs = optics, list[list[Float]](), np.full(OPTICS, np.inf), at.own_blurs
+    asked, asked_of_blurs, asked_of_tapers, sizes_at = False, False, not alike, _SIZES_AFTER
+    start, slopes, since, of_each = optics, list[list[Float]](), np.full(OPTICS, np.inf), at
     last: list[Equations | None] = [None] * len(sets)
     before: tuple[State, list[Equations], Step] | None = None
     converged, restarted, shorter, least = False, False, 0, np.inf
-    for count in range(steps + 2 * _MORE_STEPS + 1):
+    for count in range(steps + 3 * _MORE_STEPS + 1):
         optics = moved_optics(start, at.moved)
-        if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or np.abs(at.own_blurs - of_blurs).max() > _MUCH[1]:
+        if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or _far_apart(at, of_each):
             slopes = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)]
-            since, of_blurs = at.moved[:OPTICS], at.own_blurs
+            since, of_each = at.moved[:OPTICS], at
         systems = [
             linearise(w, m, k, optics, noise, parallel, expected, e)
             for w, m, k, expected, e in zip(windows, at.sets, slopes, at.expected, last, strict=True)
@@ -182,6 +183,12 @@ def fit_shared(
                         None,
                     )
                     steps, sizes_at = steps + _MORE_STEPS, count + 1 + _SIZES_AFTER
+                    continue
+            if (converged or count >= _TAPERS_AFTER) and not asked_of_tapers:
+                asked_of_tapers = True
+                if pointed := _tapers(systems, at, gain):
+                    at, converged, least, before = replace(at, sets=pointed[0], tapers=pointed[1]), False, np.inf, None
+                    steps += _MORE_STEPS
                     continue
             if (converged or count >= _ASKED_AFTER) and not asked:  # near enough to tell how far their arms differ
                 asked = True
@@ -237,10 +244,16 @@ def _odd(systems: list[Equations], at: State, gain: float) -> Regularity | None:
     return told_by(list(ways), [gain * v for v in variances], at.regularity)
 
 
-def _blurs(systems: list[Equations], gain: float) -> tuple[list[list[NeedleFit]], Blurs] | None:
+def _far_apart(at: State, before: State) -> bool:
+    """Say whether some needles have changed so much of their own that derivatives by what is common are taken anew."""
+    blurrier, tapers = np.abs(at.own_blurs - before.own_blurs), np.abs(at.own_tapers - before.own_tapers)
+    return bool(blurrier.max() > _MUCH[1] or tapers.max() > _MUCH[TAPER])
+
+
+def _blurs(systems: list[Equations], gain: float) -> tuple[list[list[NeedleFit]], Differing] | None:
     """Needles with blurs of their own, and how far these differ, where they do; ``gain``: of the variances, by noise of neighbours."""
     blurs, variances = zip(*(e.free_blurs() for e in systems), strict=True)
-    told = differing(list(blurs), [gain * v for v in variances])
+    told = differing(list(blurs), [gain * v for v in variances], MOST_BLURRIER)
     if told is None:
         return None
     sets = [
@@ -248,6 +261,19 @@ def _blurs(systems: list[Equations], gain: float) -> tuple[list[list[NeedleFit]]
         for e, of in zip(systems, blurs, strict=True)
     ]
     return sets, told
+
+
+def _tapers(systems: list[Equations], at: State, gain: float) -> tuple[list[list[NeedleFit]], Differing] | None:
+    """Pins with tapers of their own, and how far these differ, where they do; ``gain``: of the variances, by noise of neighbours."""
+    tapers, variances = zip(*(e.free_tapers() for e in systems), strict=True)
+    told = differing(list(tapers), [gain * v for v in variances], MOST_TAPER)
+    if told is None:
+        return None
+    sets = [
+        [replace(f, shape=replace(f.shape, taper=between(t, LEAST_TAPER, 1.0))) for f, t in zip(e.members, of, strict=True)]
+        for e, of in zip(systems, tapers, strict=True)
+    ]
+    return sets, replace(told, typical=told.typical - at.taper)
 
 
 def _is_uneven(precision: Float, told: Float, target: Float, moved: Float, gain: float) -> bool:

@@ -10,18 +10,17 @@ import numpy as np
 from rsa_vision.detect.balls.alike import true_spread
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, OWN, SHARED, SLANT, UNEVEN, Equations, Expected, own_parameters
+from rsa_vision.detect.needles.differing import MOST_BLURRIER, Differing
+from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, OWN, SHARED, SLANT, TAPER, UNEVEN, Equations, Expected, own_parameters
 from rsa_vision.detect.needles.fits import between
 from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms
-from rsa_vision.detect.needles.penumbra import MOST as MOST_BLURRIER
-from rsa_vision.detect.needles.penumbra import Blurs
 from rsa_vision.types import Float
 
-_LEAST_TAPER = 0.1
+LEAST_TAPER = 0.1
 _MOST = 3.0, 0.8, 0.6  # curve and tail
 _MOST_LATE, _MOST_LOGGED = 0.6, 3.0
 _MOST_UNEVEN = 0.8
-_TAPER, _LATE, _LOGGED = 2, 6, 7  # places of these in what is common
+_LATE, _LOGGED = 6, 7  # places of these in what is common
 _MOST_BY_STEP, _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP = 0.6, 0.2, 2.0
 _BLURRIER_BY_STEP = 0.2  # by a step, of one needle's
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
@@ -74,8 +73,11 @@ class State:
     moved : ndarray of shape (c,)
         What the common parameters differ from the start.
     taper : float
+        Common to all, or what each may differ from.
     sizes : Sizes
-    blurs : Blurs
+    blurs : Differing
+    tapers : Differing
+        What is typical of the differences from the common one.
     regularity : Regularity, optional
         Of the arms of tees.
     """
@@ -84,7 +86,8 @@ class State:
     moved: Float
     taper: float
     sizes: Sizes
-    blurs: Blurs
+    blurs: Differing
+    tapers: Differing
     regularity: Regularity | None
 
     @property
@@ -93,21 +96,28 @@ class State:
         return np.array([f.blurrier for members in self.sets for f in members])
 
     @property
+    def own_tapers(self) -> Float:
+        """Tapers of all needles."""
+        return np.array([f.shape.taper for members in self.sets for f in members])
+
+    @property
     def expected(self) -> list[Expected]:
         """What is expected of the needles, by sets."""
         ways = [np.zeros((len(m), WAYS)) for m in self.sets] if self.regularity is None else self.regularity.spread
-        each = zip(self.sizes.spread, self.blurs.spread, ways, strict=True)
-        return [Expected(self.sizes.typical, size, self.blurs.typical, blur, self.regularity, way) for size, blur, way in each]
+        each = zip(self.sizes.spread, self.blurs.spread, self.tapers.spread, ways, strict=True)
+        size, blur, taper = self.sizes.typical, self.blurs.typical, self.taper + self.tapers.typical
+        return [Expected(size, of_size, blur, of_blur, taper, of_taper, self.regularity, way) for of_size, of_blur, of_taper, way in each]
 
     def after(self, step: Step, systems: list[Equations], parallel: bool) -> State:
         """Return where a step leads from where these equations hold."""
-        taper = self.taper + float(step.change[_TAPER])
-        sets = [_moved(e.members, own, step.change, taper, parallel) for e, own in zip(systems, step.own, strict=True)]
+        taper = self.taper + float(step.change[TAPER])
+        all_alike = taper if self.tapers.nothing else None
+        sets = [_moved(e.members, own, step.change, all_alike, parallel) for e, own in zip(systems, step.own, strict=True)]
         sizes = replace(self.sizes, typical=self.sizes.typical + step.change[OPTICS:SHARED])
         known = self.regularity
         if known is not None and parallel:
             known = replace(known, common=known.common + step.change[SHARED:])
-        return State(sets, self.moved + step.change, taper, sizes, self.blurs, known)
+        return State(sets, self.moved + step.change, taper, sizes, self.blurs, self.tapers, known)
 
 
 def sizes_of(systems: list[Equations], sets: list[list[NeedleFit]]) -> Sizes:
@@ -133,7 +143,7 @@ def change_of(normal: Float, target: Float, at: State, start: Optics) -> Float:
     """
     least, most = np.full((2, len(target)), np.array([[-np.inf], [np.inf]]))
     for k, now, low, high in (
-        (_TAPER, at.taper, _LEAST_TAPER, 1.0),
+        (TAPER, at.taper, LEAST_TAPER, 1.0),
         (_LATE, start.late + at.moved[_LATE], 0.0, _MOST_LATE),
         (_LOGGED, start.logged + at.moved[_LOGGED], 0.0, _MOST_LOGGED),
     ):
@@ -152,7 +162,7 @@ def change_of(normal: Float, target: Float, at: State, start: Optics) -> Float:
 def _as_far(change: Float) -> float:
     """Part of a change that one step may go."""
     most = np.full(len(change), _MOST_BY_STEP)
-    most[[_TAPER, _LOGGED]] = _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP
+    most[[TAPER, _LOGGED]] = _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP
     return float(min(1.0, 1.0 / max(float((np.abs(change) / most).max()), 1e-9)))
 
 
@@ -170,8 +180,8 @@ def moved_optics(start: Optics, by: Float) -> Optics:
     return replace(start, mu_px=mu, sigma_px=sigma, curve=(bow, skewed), tail=tail, late=late, logged=logged, uneven=uneven)
 
 
-def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float, parallel: bool) -> list[NeedleFit]:
-    """Needles after a step of their own parameters and of the common ones."""
+def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: float | None, parallel: bool) -> list[NeedleFit]:
+    """Needles after a step of their own parameters and of the common ones; ``taper``: of all, if not each its own."""
     arms = len(members[0].angles)
     wider, longer, turns = *change[OPTICS:SHARED], change[SHARED:]
     turning = 1 if parallel else arms
@@ -186,10 +196,14 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
         ways = np.append(np.zeros(WAYS - each + ends), part[ends:])  # no leans where each arm has a direction of its own
         angles, lengths = moved_arms(f, ways) if arms == ARMS else (f.angles, f.shape.arms)
         length = max(length + between(part[3] + length * longer, -2.0, 2.0), 3.0)
-        shape = NeedleShape(width, length, taper, lengths)
+        shape = NeedleShape(width, length, _own_taper(f, float(part[-1] + change[TAPER])) if taper is None else taper, lengths)
         angles = angles + part[OWN : OWN + turning] + (np.concatenate([[0.0], turns]) if parallel else 0.0)
         slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[OWN + turning : ends]).reshape(2, arms)
         slants = np.clip(slants, [[-SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
         blurrier = between(f.blurrier + part[OWN - 1], -MOST_BLURRIER, MOST_BLURRIER)
         out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants, blurrier=blurrier))
     return out
+
+
+def _own_taper(fit: NeedleFit, change: float) -> float:
+    return between(fit.shape.taper + between(change, -_MOST_TAPER_BY_STEP, _MOST_TAPER_BY_STEP), LEAST_TAPER, 1.0)
