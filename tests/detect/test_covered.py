@@ -108,6 +108,16 @@ def test_an_arm_of_which_the_rest_is_hidden_is_no_pin_without_a_flag() -> None:
     assert np.count_nonzero((found.shape == "tee") & (found.flags == 0)) == len(tips) - len(hidden)
 
 
+def test_an_arm_of_what_is_no_tee_of_ours_is_no_pin_without_a_flag() -> None:
+    """Three arms at 120 degrees, of which one or two pass for pins: half of them had no flag."""
+    rng = np.random.default_rng(17)
+    tips = tips_of(rng)
+    turned = rng.uniform(0, 2 * np.pi, (len(tips), 1)) + np.deg2rad([0.0, 30.0, -30.0])
+    found = detect_markers(exposed(light_past_tees(tips, np.ones(len(tips)), turned=turned), rng), bits=16).images
+    assert np.count_nonzero(found.shape == "pin") > 5
+    assert (found.flags & MarkerFlag.UNLIKE).all()
+
+
 def test_balls_over_arms_say_so_and_how_far_off_they_may_be() -> None:
     """What comes past both is a product; they were a third of a pixel off, up to seventeen stated errors, with no flag."""
     z, flagged = [], 0

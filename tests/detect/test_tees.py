@@ -14,10 +14,10 @@ from rsa_vision.detect.balls.decide import faint_beside
 from rsa_vision.detect.balls.find import STRENGTH, fit_at
 from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.film.whitening import Filter
-from rsa_vision.detect.marks.table import perhaps_arms
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles import shared, tees
+from rsa_vision.detect.needles.arms import perhaps_arms
 from rsa_vision.detect.needles.ends import goes_on
 from rsa_vision.detect.needles.noise_along import noise_under_needles
 from rsa_vision.detect.needles.tees import GUESS, find_tees, first_tees, is_tee, optics_of_tees

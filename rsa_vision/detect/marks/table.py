@@ -18,6 +18,7 @@ from rsa_vision.detect.marks.resolve import doubt_of_number
 from rsa_vision.detect.marks.settle import STRUCTURE
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.arms import meet_others, perhaps_arms
 from rsa_vision.detect.needles.fits import excess_of, significant_misfit
 from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.flags import MarkerFlag
@@ -30,8 +31,6 @@ _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
 _UNLIKE = 2.0  # times the misfit that is usual on the film
-_FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these may be what is seen of a tee; radians
-_AT_TIP = 0.35  # of a pin's length, from its tip to where three arms meet
 _ROOM = 2.0  # standard deviations: nearer to an end of the range the mean of what is left of the noise is not that of the film
 
 
@@ -118,7 +117,7 @@ def table_of(
     arms = np.array([len(t.angles) for t in tees])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
-    flags[n:][perhaps_arms(tees, junctions)] |= MarkerFlag.UNLIKE
+    flags[n:][perhaps_arms(tees, junctions) | meet_others(film, tees)] |= MarkerFlag.UNLIKE
     if np.count_nonzero(arms == 1) < LEAST_OF_A_KIND and n >= COMPANY:  # among balls a pin or two are more likely ends of rods
         flags[np.flatnonzero(arms == 1) + n] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
@@ -151,26 +150,6 @@ def table_of(
     trust = np.where(doubted, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
     evidence = float(trust @ np.minimum(high, CAP)) * np.count_nonzero(~doubted) / max(n + m, 1)
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), evidence
-
-
-def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
-    """Say which pins may be what is seen of a tee: an edge may hide the rest.
-
-    Those at whose tips three arms meet, one of them along the pin, and those parallel to an arm of the nearest tee, where they are few.
-    """
-    pin = np.array([len(f.angles) == 1 for f in needles], bool)
-    tees = [f for f, single in zip(needles, pin, strict=True) if not single]
-    place = np.array([t.position_px for t in tees]).reshape(-1, 2)
-    few = 0 < np.count_nonzero(pin) * _FEW_PINS <= len(tees)
-    out = np.zeros(len(needles), bool)
-    for k in np.flatnonzero(pin):
-        tip, angle = needles[k].position_px, needles[k].angles[0]
-        near = junctions[np.hypot(*(junctions[:, :2] - tip).T) < _AT_TIP * needles[k].shape.length_px]
-        arms = (near[:, 2, None] + [0.0, np.pi / 2, -np.pi / 2]).ravel()
-        if few:
-            arms = np.append(arms, tees[int(np.hypot(*(place - tip).T).argmin())].angles)
-        out[k] = np.abs(np.angle(np.exp(1j * (arms - angle)))).min(initial=np.inf) < _PARALLEL
-    return out
 
 
 def _noise_is_cut_off(fit: NeedleFit, noise: NoiseModel) -> bool:

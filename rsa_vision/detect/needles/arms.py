@@ -1,0 +1,68 @@
+"""Pins that may be what was seen of a tee: by tees beside them, by what else meets at their tips."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.types import Bool, Float
+
+_FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these may be what is seen of a tee; radians
+_AT_TIP = 0.35  # of a pin's length, from its tip to where three arms meet
+_AWAY = np.array([0.35, 0.5, 0.65])  # of a pin's length from its tip, where another is sought
+_WAYS, _BESIDE, _OWN = 72, 6, 9  # directions; steps of these to what lies beside an arm, and within which all is the pin itself
+_AS_HIGH = 0.5  # of the pin's own height there
+
+
+def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
+    """Say which pins may be what is seen of a tee: an edge may hide the rest.
+
+    Those at whose tips three arms meet, one of them along the pin, and those parallel to an arm of the nearest tee, where they are few.
+    """
+    pin = np.array([len(f.angles) == 1 for f in needles], bool)
+    tees = [f for f, single in zip(needles, pin, strict=True) if not single]
+    place = np.array([t.position_px for t in tees]).reshape(-1, 2)
+    few = 0 < np.count_nonzero(pin) * _FEW_PINS <= len(tees)
+    out = np.zeros(len(needles), bool)
+    for k in np.flatnonzero(pin):
+        tip, angle = needles[k].position_px, needles[k].angles[0]
+        near = junctions[np.hypot(*(junctions[:, :2] - tip).T) < _AT_TIP * needles[k].shape.length_px]
+        arms = (near[:, 2, None] + [0.0, np.pi / 2, -np.pi / 2]).ravel()
+        if few:
+            arms = np.append(arms, tees[int(np.hypot(*(place - tip).T).argmin())].angles)
+        out[k] = np.abs(np.angle(np.exp(1j * (arms - angle)))).min(initial=np.inf) < _PARALLEL
+    return out
+
+
+def meet_others(film: NDArray[Any], needles: list[NeedleFit]) -> Bool:
+    """Say at the tips of which pins something else begins that is half as high as they are and as narrow: one of their arms, most likely.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    needles : list of NeedleFit
+        Tees among them have their arms.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    return np.array([len(f.angles) == 1 and _meets_others(film, f) for f in needles], bool)
+
+
+def _meets_others(film: NDArray[Any], pin: NeedleFit) -> bool:
+    turn = pin.angles[0] + 2 * np.pi * np.arange(_WAYS) / _WAYS
+    out = pin.shape.length_px * _AWAY[:, None]
+    at = pin.position_px[:, None, None] + np.array([out * np.cos(turn), -out * np.sin(turn)])
+    low = np.clip(np.floor(at.min((1, 2))).astype(int) - 2, 0, None)
+    high = np.ceil(at.max((1, 2))).astype(int) + 3
+    around = np.sign(pin.depth) * film[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    cols, rows = (np.asarray(of - first, np.float32) for of, first in zip(at, low, strict=True))
+    seen = cv2.remap(np.asarray(cv2.blur(around, (3, 3))), cols, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    above = seen - np.maximum(np.roll(seen, _BESIDE, axis=1), np.roll(seen, -_BESIDE, axis=1))
+    as_high: Bool = np.all(above > _AS_HIGH * above[:, :1], axis=0)
+    return bool(above[:, 0].min() > 0 and as_high[_OWN : 1 - _OWN].any())
