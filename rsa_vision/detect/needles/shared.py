@@ -35,7 +35,17 @@ from rsa_vision.detect.needles.fits import between, excess_of, scored
 from rsa_vision.detect.needles.grounds import errors_by_ground
 from rsa_vision.detect.needles.irregular import ARMS, Regularity, regular, told_by
 from rsa_vision.detect.needles.sets import beside_each, clusters
-from rsa_vision.detect.needles.states import LEAST_TAPER, Sizes, State, Step, change_of, moved_optics, of_usual_size, sizes_of
+from rsa_vision.detect.needles.states import (
+    LEAST_TAPER,
+    Sizes,
+    State,
+    Step,
+    change_of,
+    moved_optics,
+    of_several_lengths,
+    of_usual_size,
+    sizes_of,
+)
 from rsa_vision.types import Float
 
 _STEPS = 12
@@ -184,9 +194,9 @@ def fit_shared(
                     )
                     steps, sizes_at = steps + _MORE_STEPS, count + 1 + _SIZES_AFTER
                     continue
-            if (converged or count >= _TAPERS_AFTER) and not asked_of_tapers:
+            if (converged or count >= _TAPERS_AFTER) and count >= sizes_at and not asked_of_tapers:
                 asked_of_tapers = True
-                if pointed := _tapers(systems, at, gain):
+                if of_several_lengths(at.sizes) and (pointed := _tapers(systems, at, gain)):
                     at, converged, least, before = replace(at, sets=pointed[0], tapers=pointed[1]), False, np.inf, None
                     steps += _MORE_STEPS
                     continue

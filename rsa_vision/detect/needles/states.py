@@ -17,6 +17,7 @@ from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_ar
 from rsa_vision.types import Float
 
 LEAST_TAPER = 0.1
+_SEVERAL = 0.05  # spread of the logarithms of lengths; slants of up to 25 degrees make 0.03
 _MOST = 3.0, 0.8, 0.6  # curve and tail
 _MOST_LATE, _MOST_LOGGED = 0.6, 3.0
 _MOST_UNEVEN = 0.8
@@ -128,6 +129,11 @@ def sizes_of(systems: list[Equations], sets: list[list[NeedleFit]]) -> Sizes:
     told = [true_spread(values[:, k], variance[:, k]) for k in range(2)]
     spread = np.stack([np.where(belongs, sd, np.inf) for _, sd, belongs in told], axis=1)
     return Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
+
+
+def of_several_lengths(sizes: Sizes) -> bool:
+    """Say whether needles differ in length by more than a slant makes, which leaves their tapers as they are."""
+    return bool(np.median(np.concatenate(sizes.spread)[:, 1]) > _SEVERAL)
 
 
 def of_usual_size(sets: list[list[NeedleFit]]) -> list[list[NeedleFit]]:
