@@ -106,9 +106,8 @@ def _found_from(
     more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
     optics, told = common_optics(film, [f for f in sample + more if is_pin(f, noise)], optics, noise)
     tapers = TAPERS if min(abs(told - t) for t in TAPERS) < _NO_OTHER else sorted([*TAPERS, told], reverse=True)
-    _, taper, sample = _likeliest(
-        film, [f for f in sample if is_pin(f, noise)], [optics], noise, tapers
-    )  # a wide blur feigns a short point
+    # a wide blur feigns a short point
+    _, taper, sample = _likeliest(film, [f for f in sample if is_pin(f, noise)], [optics], noise, tapers)
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
     starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
     even = replace(optics, uneven=(0.0, 0.0))  # which way of those is the best does not hang on that, and it takes a table for each angle

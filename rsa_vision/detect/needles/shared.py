@@ -182,10 +182,8 @@ def fit_shared(
             if (converged or count >= _BLURS_AFTER) and not asked_of_blurs:
                 asked_of_blurs = True
                 if differ := _blurs(systems, gain):
-                    moved = at.moved.copy()
-                    moved[BENT] = [
-                        -was for was in (*start.curve, start.tail, 0.0, start.logged, *start.uneven)
-                    ]  # a curve that made up for them leads astray
+                    moved = at.moved.copy()  # a curve that made up for them leads astray
+                    moved[BENT] = [-was for was in (*start.curve, start.tail, 0.0, start.logged, *start.uneven)]
                     at, converged, least, before = (
                         replace(at, sets=differ[0], blurs=differ[1], moved=moved, sizes=sizes),
                         False,
