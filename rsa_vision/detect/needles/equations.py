@@ -20,7 +20,7 @@ from rsa_vision.types import Float, Int
 BENT, UNEVEN = slice(3, 10), slice(8, 10)
 OPTICS, SHARED = 10, 12
 OWN = 5  # tip (2), half width, length, blur; then directions, slants, and how arms differ, or the taper of a pin
-_BLUR, TAPER = 1, 2  # places of its logarithm, and of the taper, in what is common
+BLUR, TAPER, LATE, LOGGED = 1, 2, 6, 7  # places of these in what is common
 SLANT, SKEW = 0.11, 0.08  # root mean squares, of a square and a product of slopes: rays cross a film at slopes of up to a half
 # slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
 OF_SLANTS = {
@@ -251,7 +251,7 @@ def linearise(
         turns = f.depths[:, None] * block[5]
         slants = np.zeros((2, arms)) if f.slants is None else f.slants
         by_ends = (f.depths[:, None] * block[6:]).reshape(2 * arms, -1)
-        moves += [by_tip_and_size, by_common[_BLUR, None], turns.sum(0, keepdims=True) if parallel else turns, of_slants.T @ by_ends]
+        moves += [by_tip_and_size, by_common[BLUR, None], turns.sum(0, keepdims=True) if parallel else turns, of_slants.T @ by_ends]
         common[:OPTICS] += by_common
         common[OPTICS:SHARED] += size[:, None] * by_tip_and_size[2:]
         if parallel:

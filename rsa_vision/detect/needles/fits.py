@@ -63,13 +63,11 @@ def fit_needles(
     -------
     NeedleFit
     """
-    fit = _fitted(film, tip_px, angles, shape, optics, noise, quick=quick, sized=sized)
-    start = tip_px, shape
-    for _ in range(0 if quick else _GROWS):
-        if fit.explained < _WORTH or not _outgrown(fit, *start):
+    for _ in range(1 + _GROWS):
+        fit = _fitted(film, tip_px, angles, shape, optics, noise, quick=quick, sized=sized)
+        if quick or fit.explained < _WORTH or not _outgrown(fit, tip_px, shape):
             break
-        start = fit.position_px, fit.shape
-        fit = _fitted(film, fit.position_px, fit.angles, fit.shape, optics, noise, quick=False, sized=sized)
+        tip_px, angles, shape = fit.position_px, fit.angles, fit.shape
     return fit
 
 

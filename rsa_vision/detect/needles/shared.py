@@ -24,6 +24,7 @@ from rsa_vision.detect.needles.differing import MOST_BLURRIER, MOST_TAPER, Diffe
 from rsa_vision.detect.needles.disturbed import louder
 from rsa_vision.detect.needles.equations import (
     BENT,
+    BLUR,
     OPTICS,
     TAPER,
     UNEVEN,
@@ -255,7 +256,7 @@ def _odd(systems: list[Equations], at: State, gain: float) -> Regularity | None:
 def _far_apart(at: State, before: State) -> bool:
     """Say whether some needles have changed so much of their own that derivatives by what is common are taken anew."""
     blurrier, tapers = np.abs(at.own_blurs - before.own_blurs), np.abs(at.own_tapers - before.own_tapers)
-    return bool(blurrier.max() > _MUCH[1] or tapers.max() > _MUCH[TAPER])
+    return bool(blurrier.max() > _MUCH[BLUR] or tapers.max() > _MUCH[TAPER])
 
 
 def _blurs(systems: list[Equations], gain: float) -> tuple[list[list[NeedleFit]], Differing] | None:

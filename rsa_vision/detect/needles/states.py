@@ -11,7 +11,20 @@ from rsa_vision.detect.balls.alike import true_spread
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.differing import MOST_BLURRIER, Differing
-from rsa_vision.detect.needles.equations import OF_SLANTS, OPTICS, OWN, SHARED, SLANT, TAPER, UNEVEN, Equations, Expected, own_parameters
+from rsa_vision.detect.needles.equations import (
+    LATE,
+    LOGGED,
+    OF_SLANTS,
+    OPTICS,
+    OWN,
+    SHARED,
+    SLANT,
+    TAPER,
+    UNEVEN,
+    Equations,
+    Expected,
+    own_parameters,
+)
 from rsa_vision.detect.needles.fits import between
 from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms
 from rsa_vision.types import Float
@@ -21,7 +34,6 @@ _SEVERAL = 0.05  # spread of the logarithms of lengths; slants of up to 25 degre
 _MOST = 3.0, 0.8, 0.6  # curve and tail
 _MOST_LATE, _MOST_LOGGED = 0.6, 3.0
 _MOST_UNEVEN = 0.8
-_LATE, _LOGGED = 6, 7  # places of these in what is common
 _MOST_BY_STEP, _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP = 0.6, 0.2, 2.0
 _BLURRIER_BY_STEP = 0.2  # by a step, of one needle's
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
@@ -150,8 +162,8 @@ def change_of(normal: Float, target: Float, at: State, start: Optics) -> Float:
     least, most = np.full((2, len(target)), np.array([[-np.inf], [np.inf]]))
     for k, now, low, high in (
         (TAPER, at.taper, LEAST_TAPER, 1.0),
-        (_LATE, start.late + at.moved[_LATE], 0.0, _MOST_LATE),
-        (_LOGGED, start.logged + at.moved[_LOGGED], 0.0, _MOST_LOGGED),
+        (LATE, start.late + at.moved[LATE], 0.0, _MOST_LATE),
+        (LOGGED, start.logged + at.moved[LOGGED], 0.0, _MOST_LOGGED),
     ):
         least[k], most[k] = low - now, high - now
     change = np.linalg.solve(normal, target).astype(np.float64)
@@ -168,7 +180,7 @@ def change_of(normal: Float, target: Float, at: State, start: Optics) -> Float:
 def _as_far(change: Float) -> float:
     """Part of a change that one step may go."""
     most = np.full(len(change), _MOST_BY_STEP)
-    most[[TAPER, _LOGGED]] = _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP
+    most[[TAPER, LOGGED]] = _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP
     return float(min(1.0, 1.0 / max(float((np.abs(change) / most).max()), 1e-9)))
 
 
@@ -177,7 +189,7 @@ def moved_optics(start: Optics, by: Float) -> Optics:
     bow, skewed, tail = (
         between(was + step, -most, most) for was, step, most in zip((*start.curve, start.tail), by[3:6], _MOST, strict=True)
     )
-    late, logged = between(start.late + by[_LATE], 0.0, _MOST_LATE), between(start.logged + by[_LOGGED], 0.0, _MOST_LOGGED)
+    late, logged = between(start.late + by[LATE], 0.0, _MOST_LATE), between(start.logged + by[LOGGED], 0.0, _MOST_LOGGED)
     dense, blurred = np.exp(by[:2]).tolist()
     along, oblique = start.uneven + by[UNEVEN]
     part = min(1.0, _MOST_UNEVEN / max(float(np.hypot(along, oblique)), 1e-9))
