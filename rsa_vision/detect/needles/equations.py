@@ -208,7 +208,7 @@ def linearise(
     ----------
     window : Window
     members : list of NeedleFit
-    slopes : list of ndarrays of shape (8, k, n)
+    slopes : list of ndarrays of shape (10, k, n)
         As of :func:`by_optics`, one for each.
     optics : Optics
     noise : NoiseModel

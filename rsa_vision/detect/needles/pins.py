@@ -237,9 +237,7 @@ def _less_sure_along(fit: NeedleFit, typical: float, odd_px: float, optics: Opti
     by_rest = _OF_MISFIT * significant_misfit(fit, noise) / np.sqrt(excess_of(fit, noise))  # by that the table widens all of it
     # where film responds more or less than usual, it is bent more or less as well
     unlike = abs(math.log(fit.depth / typical))
-    bend = optics.curve[0]
-    by_curve = [_OF_CURVE * bend**3, _OF_UNLIKE * bend * unlike]
-    by_model = np.array([*by_curve, _OF_TAIL * optics.tail, by_rest])
+    by_model = np.array([_OF_CURVE * optics.curve[0] ** 3, _OF_UNLIKE * optics.curve[0] * unlike, _OF_TAIL * optics.tail, by_rest])
     parts = [odd_px, _POINT * fit.shape.half_width_px, *(fit.shape.length_px * by_model)]
     error_px = float(np.linalg.norm(parts))
     way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
