@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rsa_vision.detect import detect_markers
+from rsa_vision.detect.balls.usual import kinds_by_size, over_kinds
 
 from .films import film_of_balls, grid_of_balls, stored
 
@@ -80,3 +81,15 @@ def test_a_quarter_of_a_diameter_apart_among_balls_of_other_sizes_where_hardly_a
     print(f"{np.count_nonzero(flagged[double])} of {np.count_nonzero(double)} flagged, {np.count_nonzero(flagged[~double])} of the others")
     assert flagged[double].all()
     assert np.count_nonzero(flagged[~double]) <= 1
+
+
+def test_what_is_larger_is_compared_with_its_own_kind() -> None:
+    radius = np.array([3.0, 6.1, 3.1, 5.9, 3.05, 6.0, 3.4, 9.0])
+    kinds = kinds_by_size(radius, 2)
+    assert [sorted(kind.tolist()) for kind in kinds] == [[0, 2, 4, 6], [1, 3, 5]]  # the one of 9 px may be something else
+    over, spread = over_kinds(radius, radius, 2)
+    assert np.allclose(over[[6, 7]], np.log([3.4 / np.sqrt(3.05 * 3.1), 9.0 / 6.0]))
+    assert over[0] == -np.inf  # none of a kind is smaller
+    assert spread[6] < 0.04
+    assert spread[7] < 0.04
+    assert kinds_by_size(np.array([2.0, 3.0, 5.0]), 2)[0].tolist() == [0, 1, 2]

@@ -82,3 +82,29 @@ def test_peaks_along_the_rims_of_a_pair_do_not_hide_it(radius_px: float, apart: 
     images = detect_markers(stored(film), bits=16).images
     assert len(images) == len(truth)
     assert surely(images, truth)[0] == len(truth)
+
+
+@pytest.mark.parametrize("radii_px", [(3.0, 3.0), (6.0, 3.0), (6.0, 6.0)])
+@pytest.mark.parametrize("apart", [0.6, 0.8])
+def test_pairs_of_any_two_sizes_of_a_film_are_told(radii_px: tuple[float, float], apart: float) -> None:
+    """Two blobs, one of which may be two balls of one size and look like one of the other."""
+    found, z2 = 0, list[float]()
+    for seed in range(FILMS):
+        rng = np.random.default_rng(seed)
+        place = np.array([[i, j] for i in (1, 2, 3) for j in (1, 2, 3)]) * 65.0 + rng.uniform(-5, 5, (9, 2))
+        angle = rng.uniform(0, 2 * np.pi, 2)
+        way = apart * sum(radii_px) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        truth = np.concatenate([place, place[:2] + way])
+        radius = np.array([radii_px[0]] * 2 + [6.0, 6.0, 6.0, 6.0, 3.0, 3.0, 3.0] + [radii_px[1]] * 2)
+        film = film_of_balls(
+            (SIDE, SIDE), truth, radius, background=BACKGROUND, depth=DEPTH, sigma_px=1.2, noise_sd=DEPTH / 30 * BACKGROUND, rng=rng
+        )
+        images = detect_markers(stored(film), bits=16).images
+        assert len(images) <= len(truth)
+        number, square = surely(images, truth)
+        found += number
+        z2 += square
+    ratio = float(np.sqrt(np.mean(z2) / 2))
+    print(f"radii {radii_px}, {apart} of their sum apart: {found} of {FILMS * 11} found, error / sd {ratio:.2f}")
+    assert found >= FILMS * 11 - 1
+    assert ratio < 1.4

@@ -8,13 +8,14 @@ import numpy as np
 
 from rsa_vision.detect.balls.alike import SD_OF_MAD, true_spread
 from rsa_vision.detect.balls.fits import BallFits
-from rsa_vision.types import Float
+from rsa_vision.types import Float, Int
 
 _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
 _LEAST_VALUE = 1.0  # of a film
 _OUTLIER = 3.0
 _FEW = 0.25  # clear balls to one that is fitted with an edge, from which they do not tell which sizes are usual
+_APART = 1.15  # ratio of radii of two kinds
 _LEAST_SIZES = 3  # balls that tell which sizes there are
 
 
@@ -40,6 +41,50 @@ class Size:
     def radius_sd_px(self) -> float:
         """By how much radii differ from it."""
         return self.spread * self.radius_px
+
+
+def kinds_by_size(radius_px: Float, least: int) -> list[Int]:
+    """Group balls by size: where radii in a row differ by 15 % and more, smallest first.
+
+    Parameters
+    ----------
+    radius_px : ndarray of shape (n,)
+    least : int
+        Balls of one kind. Those of which there are fewer may be something else.
+
+    Returns
+    -------
+    list of ndarray of int
+        Indices; all in one where no kind has so many.
+    """
+    order = np.argsort(radius_px)
+    kinds = np.split(order, np.flatnonzero(np.diff(np.log(radius_px[order])) > np.log(_APART)) + 1)
+    return [kind for kind in kinds if len(kind) >= least] or [order]
+
+
+def over_kinds(radius_px: Float, known_px: Float, least: int) -> tuple[Float, Float]:
+    """Return by how much balls are larger than the next smaller kind of known ones, and what radii of that kind differ by.
+
+    Parameters
+    ----------
+    radius_px : ndarray of shape (n,)
+    known_px : ndarray of shape (m,)
+    least : int
+        As of :func:`kinds_by_size`.
+
+    Returns
+    -------
+    over, spread : ndarrays of shape (n,)
+        Of the logarithms; minus infinity where they are smaller than all.
+    """
+    size, known = np.log(radius_px), np.log(known_px)
+    over, spread = np.full(len(size), -np.inf), np.zeros(len(size))
+    for kind in kinds_by_size(known_px, least):
+        middle = float(np.median(known[kind]))
+        larger = size >= middle
+        over[larger] = size[larger] - middle
+        spread[larger] = SD_OF_MAD * float(np.median(np.abs(known[kind] - middle)))
+    return over, spread
 
 
 def usual_size(clear: BallFits) -> Size:

@@ -14,6 +14,7 @@ from rsa_vision.detect.balls.decide import LEAST_KNOWN, hopeless, look_clear
 from rsa_vision.detect.balls.find import CHANCE, COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.focal_spot import Spot
+from rsa_vision.detect.balls.usual import over_kinds
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
@@ -208,7 +209,7 @@ def _drawn_beside_edges(
 
 
 def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
-    """Say which balls may be two: larger than the film's known ones, and less like a ball than those.
+    """Say which balls may be two: larger than known ones of a kind, and not of a larger one, and less like a ball than those.
 
     Parameters
     ----------
@@ -222,12 +223,13 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
     """
     if len(known.depth) < LEAST_KNOWN:
         return np.zeros(len(fits.depth), bool)
+    larger = over_kinds(fits.radius_px, known.radius_px, LEAST_KNOWN)[0] > np.log(_LARGER)
     known = known.rows(np.argsort(known.chi2_core)[: max(LEAST_KNOWN, len(known.depth) // 4)])  # the others may be two themselves
     left = misfit(fits, noise)
     unlike = (
         (left > _UNLIKE * np.median(misfit(known, noise))) & (left > _LEAST_UNLIKE) & (fits.chi2_core > 1 + 5 * noise.scatter(fits.n_core))
     )
-    return np.asarray(unlike & (fits.radius_px > _LARGER * np.median(known.radius_px)))
+    return np.asarray(unlike & larger)
 
 
 def _in_one_beam(fits: BallFits) -> Bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import SURE, plausible
 from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.detect.balls.usual import kinds_by_size
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.groups import fit_group
@@ -18,10 +20,12 @@ from rsa_vision.types import Float
 LEAST_APART = 0.7  # of the radius: nearer centres cannot be told apart with confidence, and pass for one place
 LEAST_GAIN = 30.0  # twice the log-likelihood that four parameters more must gain
 STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
-_SIZES = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
+_BLOB = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
+_DEPTH = (0.4, 2.5)  # depths of the two, relative to balls of their size
 OF_A_BLOB = 0.8  # of the radius of a ball fitted to two
 CLEAR, NEARLY = 2.0 * SURE, 0.6  # significance of blobs that tell, and the part of them that one ball explains
 _VAIN = 40  # attempts of a film that may fail
+_COMPANY = 2  # balls of one size
 
 
 def split_blobs(
@@ -54,18 +58,18 @@ def split_blobs(
     like = balls if len(balls.depth) else blobs.rows((blobs.significance > CLEAR) & (blobs.explained > NEARLY))
     if len(like.depth) == 0:
         return []
-    radius, depth = (float(np.median(of)) for of in (like.radius_px, np.abs(like.depth)))
-    radius *= 1.0 if len(balls.depth) else OF_A_BLOB
-    size = blobs.radius_px / radius
-    worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (np.abs(blobs.depth) > 0.4 * depth) & (blobs.explained > 0.6)
-    least = LEAST_GAIN * noise.correlation.sum() / (np.pi * radius**2)
+    sizes = _sizes(like) if len(balls.depth) else [_Size(OF_A_BLOB * one.radius, one.depth) for one in (_usual(like),)]
+    least_radius, most_radius, least_depth = min(s.radius for s in sizes), max(s.radius for s in sizes), min(s.depth for s in sizes)
+    worth = (blobs.radius_px > _BLOB[0] * least_radius) & (blobs.radius_px < _BLOB[1] * most_radius)
+    worth &= (np.abs(blobs.depth) > _DEPTH[0] * least_depth) & (blobs.explained > 0.6)
+    least = LEAST_GAIN * noise.correlation.sum() / (np.pi * most_radius**2)
     out: list[BallFits] = []
     tried = 0
     for i in np.nonzero(worth)[0]:
         if tried - len(out) == _VAIN:
             break
         place = blobs.position_px[i]
-        if any(np.hypot(*(pair.position_px - place).T).min() < radius for pair in out):
+        if any(np.hypot(*(pair.position_px - place).T).min() < least_radius for pair in out):
             continue
         tried += 1
         others = beside()
@@ -73,23 +77,58 @@ def split_blobs(
         if whole.chi2_core[0] <= least:
             continue  # even two that left nothing would not be better by enough
         axis = long_axis(film, whole, np.sign(blobs.depth[i]))
-        for stretch in STRETCH:
-            starts = whole.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
-            pair = fit_group(film, starts, np.full(2, radius), optics.sigma_px, optics.mu_px, noise, others)
-            if _two(pair, whole, radius, depth, least, noise):
+        for offsets, radius in _starts(sizes):
+            starts = whole.position_px + offsets[:, None] * axis
+            pair = fit_group(film, starts, radius, optics.sigma_px, optics.mu_px, noise, others)
+            if _two(pair, whole, sizes, least, noise):
                 out.append(pair)
                 break
     return out
 
 
-def _two(pair: BallFits, whole: BallFits, radius: float, depth: float, least: float, noise: NoiseModel) -> bool:
+@dataclass(frozen=True, slots=True)
+class _Size:
+    """What balls of one size are like on a film."""
+
+    radius: float
+    depth: float
+
+
+def _usual(balls: BallFits) -> _Size:
+    return _Size(float(np.median(balls.radius_px)), float(np.median(np.abs(balls.depth))))
+
+
+def _sizes(balls: BallFits) -> list[_Size]:
+    """Sizes of the film's balls, the most common first; those of which there is but one ball may be something else."""
+    kinds = kinds_by_size(balls.radius_px, _COMPANY)
+    return [_usual(balls.rows(kind)) for kind in sorted(kinds, key=len, reverse=True)]
+
+
+def _starts(sizes: list[_Size]) -> Iterator[tuple[Float, Float]]:
+    """Places of two balls along the axis of a blob, in its lengths, and their radii: of any two sizes, from either end."""
+    for i, one in enumerate(sizes):
+        for two in sizes[: i + 1]:
+            for first, second in [(one, two)] if one is two else [(one, two), (two, one)]:
+                share = first.depth * first.radius**2, second.depth * second.radius**2
+                part = share[0] / sum(share)
+                between = 0.5 / np.sqrt(part * (1 - part))  # the blob's second moments are part (1 - part) of the square of this
+                for stretch in STRETCH:
+                    yield stretch * between * np.array([part - 1, part]), np.array([first.radius, second.radius])
+
+
+def _two(pair: BallFits, whole: BallFits, sizes: list[_Size], least: float, noise: NoiseModel) -> bool:
     apart = float(np.hypot(*(pair.position_px[1] - pair.position_px[0])))
-    alike = (np.abs(np.log(pair.radius_px / radius)) < 0.3) & (np.abs(pair.depth) > 0.4 * depth) & (np.abs(pair.depth) < 2.5 * depth)
+    radius, depth = (np.array([getattr(s, of) for s in sizes]) for of in ("radius", "depth"))
+    size = np.abs(np.log(pair.radius_px[:, None] / radius))
+    deep = np.abs(pair.depth)[:, None] / depth
+    alike = ((size < 0.3) & (deep > _DEPTH[0]) & (deep < _DEPTH[1])).any(axis=1)
     one_sign = pair.depth[0] * pair.depth[1] > 0
-    held = bool((np.hypot(*(pair.position_px - whole.position_px[0]).T) < 2.5 * radius).all())
+    of_size = radius[size.argmin(axis=1)]
+    held = bool((np.hypot(*(pair.position_px - whole.position_px[0]).T) < 2.5 * of_size.mean()).all())
     # the window of two is larger than that of one: compare what is left under the balls only
     better = whole.chi2_core[0] - float(pair.chi2_core.mean()) > least
-    return bool(apart > LEAST_APART * radius and alike.all() and one_sign and held and better and plausible(pair, noise).all())
+    far = apart > LEAST_APART * of_size.mean()
+    return bool(far and alike.all() and one_sign and held and better and plausible(pair, noise).all())
 
 
 def long_axis(film: NDArray[Any], blob: BallFits, sign: float) -> Float:

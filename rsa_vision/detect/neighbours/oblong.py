@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.alike import SD_OF_MAD
 from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.fits import BallFits, half_size, slopes
+from rsa_vision.detect.balls.usual import over_kinds
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.whitening import whiten_rows
@@ -22,6 +22,7 @@ from rsa_vision.types import Bool, Float
 
 _LEAST = 0.08  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make twice that
 _LEAST_OF_LARGER, _SURE_OF_LARGER = 0.02, 7.0  # the same of balls larger than the others of the film: that speaks for two as well
+_OF_A_KIND = 3  # balls
 _LARGER, _OF_SPREAD = 0.05, 3.0  # of the logarithm of the radius; of what radii of the film differ by
 _SURE = 14.0  # chi2 with two degrees of freedom: one image in a thousand, if noise makes that much of an outline at all
 _BEYOND_DOUBT, _OF_USUAL = 50.0, 3.0  # the same of smaller ones; times the usual outline of the film
@@ -75,10 +76,9 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
 
 
 def _larger(radius_px: Float) -> Bool:
-    """Say which balls are larger than what radii of the film differ by."""
-    size = np.log(radius_px)
-    over = size - np.median(size)
-    return np.asarray(over > max(_LARGER, _OF_SPREAD * SD_OF_MAD * float(np.median(np.abs(over)))))
+    """Say which balls are larger than those of a kind, and not of a larger one, by more than radii of the kind differ by."""
+    over, spread = over_kinds(radius_px, radius_px, _OF_A_KIND)
+    return np.asarray(over > np.maximum(_LARGER, _OF_SPREAD * spread))
 
 
 def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
