@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
-from rsa_vision.detect.models.needle_tables import by_film_curve, film_curve
+from rsa_vision.detect.models.film_curve import by_film_curve, film_curve
 from rsa_vision.detect.models.needles import NeedleShape, arm_images, arms_by_optics
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float

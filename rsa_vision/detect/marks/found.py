@@ -29,10 +29,11 @@ from rsa_vision.detect.needles.first_pins import look_for_pins
 from rsa_vision.detect.needles.pins import find_pins
 from rsa_vision.detect.needles.sets import is_located, on_arms
 from rsa_vision.detect.needles.tees import find_tees, is_tee
-from rsa_vision.detect.neighbours.beside import images_beside, lapping_balls
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, groups_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.neighbours.rims import goes_on
+from rsa_vision.detect.neighbours.under_curve import under_curve
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float, Int, MarkerImages
 
@@ -224,7 +225,9 @@ def _measured(
     if curve is not None:
         known = replace(known, covariance=under * known.covariance, chi2_uneven=known.chi2_uneven / under)
         noise, under = curve, 1.0
-    balls, ratio, by_size, covered = settle(film, replace(found, fits=known), around.places, under, free, beside, optics, noise)
+    bent, under_one_curve = under_curve(film, known, found.edged, clear, _undisturbed(found, optics), optics, noise, painted)
+    found = replace(found, fits=bent, edged=found.edged & ~under_one_curve)
+    balls, ratio, by_size, covered = settle(film, found, around.places, under, free, beside, optics, noise)
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
         over = painted.under(balls.position_px, balls.radius_px) > _OVER * np.abs(balls.depth)
         touching, by_size = touching | over, by_size + over * (_PULL * balls.radius_px) ** 2
@@ -239,6 +242,13 @@ def _measured(
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
     doubtful = lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
     return table_of(film, bits, balls, under, ratio, by_size, touching, poor, doubtful, others, faint.junctions, optics, noise)
+
+
+def _undisturbed(found: Balls, optics: Optics) -> list[Int]:
+    """Groups of balls whose images touch, with nothing else on them."""
+    plain = ~(found.crossed | found.drawn)
+    groups = [np.array(g) for g in groups_of(found.fits, optics)]
+    return [g for g in groups if 1 < len(g) <= MOST_IN_GROUP and plain[g].all()]
 
 
 def _nothing(cols: Float, _: Float) -> Float:

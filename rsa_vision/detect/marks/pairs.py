@@ -14,7 +14,8 @@ from rsa_vision.detect.balls.optics import KAPPA, SIGMAS_PX, ball_evidence, unex
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.blobs import CLEAR, LEAST_GAIN, NEARLY, OF_A_BLOB, STRETCH, long_axis
-from rsa_vision.detect.neighbours.groups import GroupWindow, fit_group, images_in, window_around
+from rsa_vision.detect.neighbours.group_images import GroupWindow, images_in, window_around
+from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float

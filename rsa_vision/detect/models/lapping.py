@@ -17,11 +17,11 @@ _ROOM_PX = 2 * _STEP_PX
 _BLURS = 4.0  # beyond which the blurred product has faded
 
 
-def lapping(local: Float, radius: Float) -> list[tuple[int, int]]:
-    """Return the pairs of balls whose shadows lie over each other, by their places (k, 2) and radii (k,)."""
+def lapping(local: Float, radius: Float, beside_px: float = 0.0) -> list[tuple[int, int]]:
+    """Return the pairs of balls whose shadows lie over each other, or as near, by their places (k, 2) and radii (k,)."""
     k = len(radius)
     gap = np.hypot(*(local[:, None] - local[None]).transpose(2, 0, 1))
-    over = gap < radius[:, None] + radius[None] - _STEP_PX
+    over = gap < radius[:, None] + radius[None] - _STEP_PX + beside_px
     return [(i, j) for i in range(k) for j in range(i) if over[i, j]]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
+from rsa_vision.detect.models.film_curve import by_film_curve, film_curve
 from rsa_vision.detect.models.profiles import TAIL, Optics
 from rsa_vision.types import Float
 
@@ -119,27 +120,6 @@ def _obliquely_blurred(image: Single, lights: list[tuple[float, float, float, fl
     square_s, both, square_p = at_s**2, at_s * at_p, at_p**2
     passed = sum(part * np.exp(-0.5 * (var_s * square_s + var_p * square_p) - by_both * both) for part, var_s, var_p, by_both in lights)
     return np.asarray(irfft2(rfft2(image, s=padded) * passed, s=padded)[:rows, :cols], np.float32)
-
-
-def film_curve(opacity: Float | Single, curve: tuple[float, float]) -> Float:
-    """What film shows of blurred opacities, by the two coefficients of :attr:`Optics.curve`."""
-    shifted = _shifted(opacity, curve[0])
-    return np.asarray(shifted + curve[1] * shifted * (1 - shifted) * (1 - 2 * shifted))
-
-
-def by_film_curve(opacity: Float | Single, curve: tuple[float, float]) -> list[Float]:
-    """Derivatives of what film shows by the two coefficients of its curve, whatever is blurred after it."""
-    shifted = _shifted(opacity, curve[0])
-    bow = shifted * (1 - shifted)
-    return [bow * (1 + curve[1] * (1 - 6 * bow)), bow * (1 - 2 * shifted)]
-
-
-def _shifted(opacity: Float | Single, by: float) -> Float:
-    """Opacities whose log odds are by so much more; those of overshoots, which have none, go on straight."""
-    within = np.asarray(np.clip(opacity, 0.0, 1.0), np.float64)
-    beyond = opacity - within
-    factor = math.exp(by)
-    return np.asarray(within / (within + (1 - within) / factor) + beyond * np.where(beyond < 0, factor, 1 / factor))
 
 
 def _grid(half_width: float, length: float, sigma: float) -> tuple[tuple[float, float], tuple[int, int]]:

@@ -35,8 +35,9 @@ class Optics:
     mu_px : float
         Attenuation per pixel of chord. It takes part of the bend of the film curve: flatter tops, more attenuation.
     curve : tuple of float
-        The rest of it, which pins tell: of the blurred opacity ``o`` film shows ``g + curve[1] g (1 - g) (1 - 2 g)``, where the log odds of
-        ``g`` are those of ``o`` plus ``curve[0]``. Negative where film answers more the more of its light is gone, as density does.
+        The rest of it, which pins tell, and balls that lie over each other: of the blurred opacity ``o`` film shows
+        ``g + curve[1] g (1 - g) (1 - 2 g)``, where the log odds of ``g`` are those of ``o`` plus ``curve[0]``. Negative where film answers
+        more the more of its light is gone, as density does.
     tail : float
         Part of the light that is spread ``TAIL`` times as far as the rest: of screens, scanners and scatter nearby.
     late : float

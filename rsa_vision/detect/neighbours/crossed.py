@@ -14,7 +14,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import Background
 from rsa_vision.detect.neighbours.foreign import beyond_noise, robust_residual
-from rsa_vision.detect.neighbours.groups import images_in, window_around
+from rsa_vision.detect.neighbours.group_images import images_in, window_around
 from rsa_vision.types import Bool, Float
 
 _LEAST_SEEN: Final = 0.4  # part of the pixels under a ball

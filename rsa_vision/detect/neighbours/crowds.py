@@ -15,7 +15,8 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import Background, all_but, deep_at
 from rsa_vision.detect.neighbours.blobs import LEAST_APART, STRETCH, long_axis
-from rsa_vision.detect.neighbours.groups import fit_group, images_in, window_around
+from rsa_vision.detect.neighbours.group_images import images_in, window_around
+from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
 

@@ -13,7 +13,8 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import columns
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.blobs import STRETCH, long_axis
-from rsa_vision.detect.neighbours.groups import GroupWindow, fit_group, images_in, window_around
+from rsa_vision.detect.neighbours.group_images import GroupWindow, images_in, window_around
+from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.types import Bool, Float
 
 _LEAST_SPREAD, _MOST_SPREAD = 0.2, 0.35  # of the logarithms of what balls of one film have in common

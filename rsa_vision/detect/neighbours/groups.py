@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.equations import invert, polynomial
-from rsa_vision.detect.balls.fits import BallFits, half_size, radii, uneven, uneven_white
-from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
+from rsa_vision.detect.balls.equations import invert
+from rsa_vision.detect.balls.fits import BallFits, radii, uneven, uneven_white
+from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.film.patches import columns, cut, damped_solution, weighted_least_squares
+from rsa_vision.detect.film.patches import columns, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.whitening import whiten_rows
-from rsa_vision.detect.models.edge import edge_profile
-from rsa_vision.detect.models.lapping import LEAST, lapping, product_image
-from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.neighbours.group_images import GroupImages, GroupWindow, images_in, window_around
 from rsa_vision.types import Float
 
 _STEPS = 25
@@ -42,6 +39,7 @@ def fit_group(
     bent: bool = False,
     blurrier: float = 0.0,
     spot: Spot | None = None,
+    images: Callable[[GroupWindow, Float, Float, Float], GroupImages] | None = None,
 ) -> BallFits:
     """Fit several balls in one window on one background.
 
@@ -65,6 +63,8 @@ def fit_group(
         Logarithm of the blur of these balls over the film's, in the same window.
     spot : Spot, optional
         That draws them, if it is no Gaussian; they do not lap, then.
+    images : callable, optional
+        ``images(window, surface, local, radius)``: what draws them instead, on a background without an edge.
 
     Returns
     -------
@@ -80,17 +80,23 @@ def fit_group(
     local, radius = start_px - window.corner_px, np.clip(start_radius_px, low, high).astype(np.float64)
     surface = window.surface
     weight = valid / noise.variance_at(window.raw)
-    images = images_in(window, surface, local, radius, sigma_px, mu_px, spot=spot)
-    theta = weighted_least_squares(images.linear, weight, data, 1e-6)
-    if edge:
-        surface = columns([surface.T, window.edge(data - images.value.T @ theta[:k], sigma_px)])
-        images = images_in(window, surface, local, radius, sigma_px, mu_px, spot=spot)
-        theta = weighted_least_squares(images.linear, weight, data, 1e-6)
     ground: Float | None = None
+
+    def draw(local: Float, radius: Float) -> GroupImages:
+        if images:
+            return images(window, surface, local, radius)
+        return images_in(window, surface, local, radius, sigma_px, mu_px, ground, spot)
+
+    seen = draw(local, radius)
+    theta = weighted_least_squares(seen.linear, weight, data, 1e-6)
+    if edge:
+        surface = columns([surface.T, window.edge(data - seen.value.T @ theta[:k], sigma_px)])
+        seen = draw(local, radius)
+        theta = weighted_least_squares(seen.linear, weight, data, 1e-6)
     converged, lost, before = False, np.zeros(k, bool), np.zeros((3, k))
     most = max(_MOST_PX, _MOST_RADII * float(radius.min()))
     for step in range(_STEPS + 1):
-        value, linear, jac = images.value, images.linear, images.jacobian(theta)
+        value, linear, jac = seen.value, seen.linear, seen.jacobian(theta)
         residual = data - linear @ theta
         if step == _STEPS or converged or lost.any():
             break
@@ -108,12 +114,12 @@ def fit_group(
         converged, lost = step > 2 and farthest < _CONVERGED_PX, (np.abs(move).max(axis=0) > most) & (step >= _ARRIVED)
         if edge:
             if taken:
-                ground = _under(images.value, surface @ theta[k : k + surface.shape[1]])
+                ground = _under(seen.value, surface @ theta[k : k + surface.shape[1]])
             if step in _LOOKED_AGAIN:
-                bare = data - images.linear[:, :k] @ theta[:k] - images.of_ground(theta)
+                bare = data - seen.linear[:, :k] @ theta[:k] - seen.of_ground(theta)
                 surface = columns([window.surface.T, window.edge(bare, sigma_px, bent=bent)])
-        images = images_in(window, surface, local, radius, sigma_px, mu_px, ground, spot)
-        theta = weighted_least_squares(images.linear, weight, data, 1e-9)
+        seen = draw(local, radius)
+        theta = weighted_least_squares(seen.linear, weight, data, 1e-9)
     root = np.sqrt(weight)[:, None]
     estimator = _estimator(jac * root, size, noise)[: 4 * k]
     last = (estimator @ (residual * root[:, 0])).reshape(4, k)
@@ -145,6 +151,13 @@ def fit_group(
         n_core=inside,
         converged=np.full(k, converged),
     )
+
+
+def _under(value: Float, background: Float) -> Float:
+    """Return by how much the background differs from its mean under each ball, at most by one; shape (k, n)."""
+    mean = (value @ background) / np.maximum(value.sum(axis=1), 1e-9)
+    apart = background - mean[:, None]
+    return np.asarray(apart / max(float(np.abs(apart).max()), 1e-9))
 
 
 def _estimator(weighted: Float, size: int, noise: NoiseModel) -> Float:
@@ -189,115 +202,3 @@ def edge_gain(
     plain = slice(jac.shape[1] - len(edge))
     with_edge, without = (right[part] @ damped_solution(normal[part, part], right[part], 1e-9) for part in (slice(None), plain))
     return float(with_edge - without)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GroupWindow:
-    """The pixels around a group, in one row each: (n,) unless said otherwise."""
-
-    size: int
-    corner_px: Float  # (col, row) on the film
-    cols: Float  # in the window, as rows
-    rows: Float
-    raw: Float
-    neighbours: Float
-    valid: Float
-    surface: Float  # (n, 6)
-
-    def edge(self, bare: Float, sigma_px: float, *, bent: bool = False) -> Float:
-        """Return profiles of the edge that the window shows without its marks (n,), shape (p, n)."""
-        box = (self.size, self.size)
-        return edge_profile(bare.reshape(box), self.valid.reshape(box), sigma_px, bent=bent)
-
-    def left_by(self, basis: Float, noise: NoiseModel) -> tuple[Float, Float]:
-        """Return what the best combination of the columns of ``basis`` leaves, and the weights of the pixels."""
-        weight, data = self.valid / noise.variance_at(self.raw), self.raw - self.neighbours
-        return data - basis @ weighted_least_squares(basis, weight, data), weight
-
-
-def window_around(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: float, noise: NoiseModel, others: Any) -> GroupWindow:
-    """Cut the window that balls at these places need, with the images of neighbours as of :func:`fit_group`."""
-    middle = at_px.mean(0)
-    half = half_size(float(radius_px.max()), sigma_px) + int(np.ceil(float(np.abs(at_px - middle).max())))
-    patch = cut(film, middle[None], half, noise)
-    corner = patch.corner_px[0].astype(np.float64)
-    cols, rows, surface = square(half)
-    raw = patch.values[0].ravel()
-    neighbours = np.zeros_like(raw) if others is None else others(cols + corner[0], rows + corner[1])
-    valid = patch.valid[0].ravel().astype(np.float64)
-    return GroupWindow(patch.size, corner, cols, rows, raw, neighbours, valid, surface)
-
-
-@lru_cache(maxsize=64)
-def square(half: int) -> tuple[Float, Float, Float]:
-    """Return the columns and rows (n,) of the pixels of a window of this half side, and a quadratic surface on it (n, 6)."""
-    rows, cols = np.mgrid[0 : 2 * half + 1, 0 : 2 * half + 1].reshape(2, -1).astype(np.float64)
-    surface = polynomial(half, cols - half, rows - half)
-    for shared in (cols, rows, surface):
-        shared.setflags(write=False)
-    return cols, rows, surface
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GroupImages:
-    """What balls at given places look like in a window, with all that enters it linearly."""
-
-    value: Float  # (k, n)
-    slopes: Float  # (3, k, n), of each ball by its col, row and radius
-    linear: Float  # (n, p): balls, background, products of balls with an edge under them, of two balls
-    ground: Float | None  # (k, n), the edge under each
-    pairs: list[tuple[int, int]]
-    of_pairs: list[Float]  # slopes of the products
-
-    def jacobian(self, theta: Float) -> Float:
-        """Return the derivatives by all cols, rows and radii, then by the linear parameters; shape (n, 3 k + p)."""
-        k = len(self.value)
-        by_shape = theta[:k, None] * self.slopes
-        if self.ground is not None:
-            by_shape += theta[self.of_grounds, None] * self.ground * self.slopes
-        for of_product, pair, by in zip(theta[len(theta) - len(self.pairs) :], self.pairs, self.of_pairs, strict=True):
-            by_shape[:, list(pair)] += of_product * by.transpose(1, 0, 2)
-        return columns([by_shape.reshape(3 * k, -1), self.linear.T])
-
-    def of_ground(self, theta: Float) -> Float:
-        """Return what balls take away of the edge under them, shape (n,)."""
-        return np.zeros(self.value.shape[1]) if self.ground is None else theta[self.of_grounds] @ (self.ground * self.value)
-
-    @property
-    def of_grounds(self) -> range:
-        """Which of the linear columns those are."""
-        end = self.linear.shape[1] - len(self.pairs)
-        return range(end - (0 if self.ground is None else len(self.value)), end)
-
-
-def _under(value: Float, background: Float) -> Float:
-    """Return by how much the background differs from its mean under each ball, at most by one; shape (k, n)."""
-    mean = (value @ background) / np.maximum(value.sum(axis=1), 1e-9)
-    apart = background - mean[:, None]
-    return np.asarray(apart / max(float(np.abs(apart).max()), 1e-9))
-
-
-def images_in(
-    window: GroupWindow,
-    surface: Float,
-    local: Float,
-    radius: Float,
-    sigma_px: float,
-    mu_px: float,
-    ground: Float | None = None,
-    spot: Spot | None = None,
-) -> GroupImages:
-    """Draw balls at places (k, 2) in a window; ``ground``: what is under them and they take their part of."""
-    dx, dy = window.cols - local[:, :1], window.rows - local[:, 1:]
-    value, by_dx, by_dy, by_radius = shapes_of(Optics(sigma_px, mu_px), spot, dx, dy, radius)
-    # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
-    pairs: list[tuple[int, int]] = []
-    products: list[Float] = []
-    of_pairs: list[Float] = []
-    for pair in lapping(local, radius):
-        product, by = product_image(local[list(pair)], radius[list(pair)], sigma_px, mu_px, window.size)
-        if product.max() > LEAST:
-            pairs, products, of_pairs = [*pairs, pair], [*products, product[None]], [*of_pairs, by]
-    # a mark takes away its part of what is there: on linear films more beside an implant than behind it, on films of density as much
-    linear = columns([value, surface.T, *([] if ground is None else [ground * value]), *products])
-    return GroupImages(value, np.stack([-by_dx, -by_dy, by_radius]), linear, ground, pairs, of_pairs)

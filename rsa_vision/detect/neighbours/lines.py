@@ -20,7 +20,8 @@ from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, all_but, groups_of, images_beside
-from rsa_vision.detect.neighbours.groups import fit_group, square
+from rsa_vision.detect.neighbours.group_images import square
+from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.detect.neighbours.rims import goes_on
 from rsa_vision.types import Bool, Float
 
