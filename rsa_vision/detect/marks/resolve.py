@@ -223,7 +223,8 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
     """
     if len(known.depth) < LEAST_KNOWN:
         return np.zeros(len(fits.depth), bool)
-    larger = over_kinds(fits.radius_px, known.radius_px, LEAST_KNOWN)[0] > np.log(_LARGER)
+    clear = known.rows(look_clear(known, noise))
+    larger = over_kinds(fits.radius_px, (clear if len(clear.depth) else known).radius_px, LEAST_KNOWN)[0] > np.log(_LARGER)
     known = known.rows(np.argsort(known.chi2_core)[: max(LEAST_KNOWN, len(known.depth) // 4)])  # the others may be two themselves
     left = misfit(fits, noise)
     unlike = (

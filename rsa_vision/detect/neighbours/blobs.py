@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.balls.decide import look_clear
 from rsa_vision.detect.balls.find import SURE, plausible
 from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.balls.usual import kinds_by_size
@@ -58,7 +59,7 @@ def split_blobs(
     like = balls if len(balls.depth) else blobs.rows((blobs.significance > CLEAR) & (blobs.explained > NEARLY))
     if len(like.depth) == 0:
         return []
-    sizes = _sizes(like) if len(balls.depth) else [_Size(OF_A_BLOB * one.radius, one.depth) for one in (_usual(like),)]
+    sizes = _sizes(like, noise) if len(balls.depth) else [_Size(OF_A_BLOB * one.radius, one.depth) for one in (_usual(like),)]
     least_radius, most_radius, least_depth = min(s.radius for s in sizes), max(s.radius for s in sizes), min(s.depth for s in sizes)
     worth = (blobs.radius_px > _BLOB[0] * least_radius) & (blobs.radius_px < _BLOB[1] * most_radius)
     worth &= (np.abs(blobs.depth) > _DEPTH[0] * least_depth) & (blobs.explained > 0.6)
@@ -98,10 +99,13 @@ def _usual(balls: BallFits) -> _Size:
     return _Size(float(np.median(balls.radius_px)), float(np.median(np.abs(balls.depth))))
 
 
-def _sizes(balls: BallFits) -> list[_Size]:
-    """Sizes of the film's balls, the most common first; those of which there is but one ball may be something else."""
-    kinds = kinds_by_size(balls.radius_px, _COMPANY)
-    return [_usual(balls.rows(kind)) for kind in sorted(kinds, key=len, reverse=True)]
+def _sizes(balls: BallFits, noise: NoiseModel) -> list[_Size]:
+    """Sizes of the film's balls, the most common first, as far as clear ones tell; of which there is but one ball may be something else."""
+    clear = balls.rows(look_clear(balls, noise))
+    if len(clear.depth) < _COMPANY:
+        return [_usual(balls)]
+    kinds = kinds_by_size(clear.radius_px, _COMPANY)
+    return [_usual(clear.rows(kind)) for kind in sorted(kinds, key=len, reverse=True)]
 
 
 def _starts(sizes: list[_Size]) -> Iterator[tuple[Float, Float]]:
