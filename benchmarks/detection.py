@@ -333,6 +333,15 @@ def main() -> None:
         ),
         films,
     )
+    bent_pairs = run(
+        (
+            ({"response": r, "apart, diameters": a, "CNR": c}, Case("pair", 4.0, c, apart=a, companions=True, across=6, response=r))
+            for r in ("log", "density", "transmission")
+            for a in ((0.8,) if quick else (0.6, 0.8, 1.0))
+            for c in ((20.0,) if quick else (50.0, 20.0))
+        ),
+        films,
+    )
     clock = speed(1 if quick else 3)
     real = real_tables(args.real)
 
@@ -358,6 +367,7 @@ def main() -> None:
         "Film responses (tees and pins of half width 2.5 px, balls beside)": bent,
         "Bone (tees and pins, balls beside)": over_bone,
         "Neighbours: two balls of radius 4 px side by side": pairs,
+        "Neighbours on film responses": bent_pairs,
         "Films of 4000 x 4750 pixels, one thread": clock,
         **real,
     }.items():
