@@ -59,7 +59,8 @@ def split_blobs(
     like = balls if len(balls.depth) else blobs.rows((blobs.significance > CLEAR) & (blobs.explained > NEARLY))
     if len(like.depth) == 0:
         return []
-    sizes = _sizes(like, noise) if len(balls.depth) else [_Size(OF_A_BLOB * one.radius, one.depth) for one in (_usual(like),)]
+    usual = _usual(like)
+    sizes = _sizes(like, noise) if len(balls.depth) else [_Size(OF_A_BLOB * usual.radius, usual.depth)]
     least_radius, most_radius, least_depth = min(s.radius for s in sizes), max(s.radius for s in sizes), min(s.depth for s in sizes)
     worth = (blobs.radius_px > _BLOB[0] * least_radius) & (blobs.radius_px < _BLOB[1] * most_radius)
     worth &= (np.abs(blobs.depth) > _DEPTH[0] * least_depth) & (blobs.explained > 0.6)
