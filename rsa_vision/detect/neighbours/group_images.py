@@ -77,11 +77,10 @@ class GroupImages:
 
     value: Float  # (k, n)
     slopes: Float  # (3, k, n), of each ball by its col, row and radius
-    linear: Float  # (n, p): balls, background, products of balls with an edge under them, of two balls where no film curve tells them
+    linear: Float  # (n, p): balls, background, products of balls with an edge under them, of two balls
     ground: Float | None  # (k, n), the edge under each
     pairs: list[tuple[int, int]]
     of_pairs: list[Float]  # slopes of the products
-    held: bool = False  # a film curve tells the products: they are in the images of their balls, half in each
 
     def jacobian(self, theta: Float) -> Float:
         """Return the derivatives by all cols, rows and radii, then by the linear parameters; shape (n, 3 k + p)."""
@@ -89,10 +88,13 @@ class GroupImages:
         by_shape = theta[:k, None] * self.slopes
         if self.ground is not None:
             by_shape += theta[self.of_grounds, None] * self.ground * self.slopes
-        products = [theta[list(p)].mean() for p in self.pairs] if self.held else theta[len(theta) - len(self.pairs) :]
-        for of_product, pair, by in zip(products, self.pairs, self.of_pairs, strict=True):
+        for of_product, pair, by in zip(self.of_products(theta), self.pairs, self.of_pairs, strict=True):
             by_shape[:, list(pair)] += of_product * by.transpose(1, 0, 2)
         return columns([by_shape.reshape(3 * k, -1), self.linear.T])
+
+    def of_products(self, theta: Float) -> Float:
+        """Return by how much the products of two are to be multiplied, one for each pair."""
+        return theta[len(theta) - len(self.pairs) :]
 
     def of_ground(self, theta: Float) -> Float:
         """Return what balls take away of the edge under them, shape (n,)."""
@@ -130,34 +132,6 @@ def images_in(
     return GroupImages(value, slopes, linear, ground, pairs, of_pairs)
 
 
-def images_under_curve(window: GroupWindow, surface: Float, local: Float, radius: Float, optics: Optics, *, one_light: bool) -> GroupImages:
-    """Draw balls at places (k, 2) as a film shows them whose curve is known: what it shows of two together is known as well.
-
-    ``one_light``: they lie in one beam, and the second takes from what the first has left; those of two exposures add up.
-    """
-    opacity, by = _alone(window, local, radius, optics.sigma_px, optics.mu_px, None)
-    pairs = lapping(local, radius, _BESIDE * optics.sigma_px)
-    products = [_shared(window, local, radius, optics, pair, one_light=one_light) for pair in pairs]
-    shown = Opacities(opacity, pairs, [product for product, _ in products])
-    slopes = slope_of_film_curve(opacity, optics.curve) * by
-    of_pairs = [
-        slope_of_film_curve(together, optics.curve) * (by[:, pair].swapaxes(0, 1) - by_product) - slopes[:, pair].swapaxes(0, 1)
-        for pair, together, (_, by_product) in zip(map(list, pairs), shown.together, products, strict=True)
-    ]
-    value = shown.under(partial(film_curve, curve=optics.curve))
-    return GroupImages(value, slopes, columns([value, surface.T]), None, pairs, of_pairs, held=True)
-
-
-def _shared(
-    window: GroupWindow, local: Float, radius: Float, optics: Optics, pair: tuple[int, int], *, one_light: bool
-) -> tuple[Float, Float]:
-    """By how much the opacity of both is less than the sum, (n,), and its slopes (2, 3, n)."""
-    if not one_light:
-        return np.zeros(len(window.cols)), np.zeros((2, 3, len(window.cols)))
-    both = list(pair)
-    return product_image(local[both], radius[both], optics.sigma_px, optics.mu_px, window.size)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Opacities:
     """Blurred opacities of balls in a window, and of those together that lie over each other."""
@@ -178,6 +152,47 @@ class Opacities:
         for pair, together in zip(self.pairs, self.together, strict=True):
             out[list(pair)] += 0.5 * (curve(together) - each[list(pair)].sum(axis=0))
         return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImagesUnderCurve(GroupImages):
+    """The same where a film curve tells the products: they are in the images of their balls, half in each."""
+
+    light: Opacities
+
+    def of_products(self, theta: Float) -> Float:
+        """Return the means of the depths of both balls."""
+        return np.array([theta[list(pair)].mean() for pair in self.pairs])
+
+
+def images_under_curve(
+    window: GroupWindow, surface: Float, local: Float, radius: Float, optics: Optics, *, one_light: bool
+) -> ImagesUnderCurve:
+    """Draw balls at places (k, 2) as a film shows them whose curve is known: what it shows of two together is known as well.
+
+    ``one_light``: they lie in one beam, and the second takes from what the first has left; those of two exposures add up.
+    """
+    opacity, by = _alone(window, local, radius, optics.sigma_px, optics.mu_px, None)
+    pairs = lapping(local, radius, _BESIDE * optics.sigma_px)
+    products = [_shared(window, local, radius, optics, pair, one_light=one_light) for pair in pairs]
+    shown = Opacities(opacity, pairs, [product for product, _ in products])
+    slopes = slope_of_film_curve(opacity, optics.curve) * by
+    of_pairs = [
+        slope_of_film_curve(together, optics.curve) * (by[:, pair].swapaxes(0, 1) - by_product) - slopes[:, pair].swapaxes(0, 1)
+        for pair, together, (_, by_product) in zip(map(list, pairs), shown.together, products, strict=True)
+    ]
+    value = shown.under(partial(film_curve, curve=optics.curve))
+    return ImagesUnderCurve(value, slopes, columns([value, surface.T]), None, pairs, of_pairs, shown)
+
+
+def _shared(
+    window: GroupWindow, local: Float, radius: Float, optics: Optics, pair: tuple[int, int], *, one_light: bool
+) -> tuple[Float, Float]:
+    """By how much the opacity of both is less than the sum, (n,), and its slopes (2, 3, n)."""
+    if not one_light:
+        return np.zeros(len(window.cols)), np.zeros((2, 3, len(window.cols)))
+    both = list(pair)
+    return product_image(local[both], radius[both], optics.sigma_px, optics.mu_px, window.size)
 
 
 def opacities_in(window: GroupWindow, local: Float, radius: Float, optics: Optics, *, one_light: bool) -> Opacities:

@@ -22,7 +22,7 @@ from rsa_vision.detect.film.patches import weighted_least_squares
 from rsa_vision.detect.models.film_curve import by_film_curve, film_curve
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import Background, all_but
-from rsa_vision.detect.neighbours.group_images import GroupImages, GroupWindow, images_under_curve, opacities_in, window_around
+from rsa_vision.detect.neighbours.group_images import GroupWindow, ImagesUnderCurve, images_under_curve, opacities_in, window_around
 from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.types import Bool, Float, Int
 
@@ -59,7 +59,7 @@ class _Rest:
     """What a group leaves at its best, to first order."""
 
     group: _Group
-    images: GroupImages
+    images: ImagesUnderCurve
     depth: Float  # (k,)
     own: Float  # (n, p), derivatives by its own numbers, weighted and of length one
     scale: Float  # (p,), their lengths
@@ -278,9 +278,9 @@ def _told(rest: _Rest, common: Float) -> _Told:
     def by_curve(which: int, opacity: Float) -> Float:
         return by_film_curve(opacity, optics.curve)[which]
 
-    before, light = rest.images.value.T @ rest.depth, opacities(optics)
+    before = rest.images.value.T @ rest.depth
     by = [(shown(_optics(common + step)) - before) / step.sum() for step in _STEP]
-    by += [light.under(partial(by_curve, which)).T @ rest.depth for which in (0, 1)]
+    by += [rest.images.light.under(partial(by_curve, which)).T @ rest.depth for which in (0, 1)]
     shared = np.stack(by, axis=1) * np.sqrt(group.weight)[:, None]
     by_own = rest.inverse @ (rest.own.T @ shared)
     left = shared - rest.own @ by_own
