@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, as_completed
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
@@ -40,7 +41,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of an examination: its rows in every table, hashes of its films, and whether an earlier result was kept."""
+    """What became of an examination: its rows in every table, hashes of its films and their pixels, and whether it was kept."""
 
     subject: str
     exam: str
@@ -48,6 +49,7 @@ class Outcome:
     kept: bool = False
     inputs: Mapping[str, str] = field(default_factory=dict)
     trace: str = ""
+    pixels: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def status(self) -> str:
@@ -133,7 +135,7 @@ def measure_task(task: Task) -> Outcome:
         wanted = fingerprint({**task.depends_on, "version": version(), "exam": [files.subject, files.exam], "films": inputs})
         record = read_record(path)
         if record and not task.redo and is_finished(record, wanted):
-            return Outcome(files.subject, files.exam, record["rows"], True, inputs)
+            return Outcome(files.subject, files.exam, record["rows"], True, inputs, pixels=_pixels(record["films"]))
         rows, about, pictures = _measure(task, started)
     except UsageError:
         raise
@@ -146,11 +148,17 @@ def measure_task(task: Task) -> Outcome:
     except Exception as error:  # one examination never stops a run; the trace is kept in run.json
         return _failed(files, "internal", f"{type(error).__name__}: {error}", started, inputs, traceback.format_exc())
     write_record(path, {"fingerprint": wanted, "rows": rows, "films": about, "inputs": inputs}, pictures)
-    return Outcome(files.subject, files.exam, rows, False, inputs)
+    return Outcome(files.subject, files.exam, rows, False, inputs, pixels=_pixels(about))
+
+
+def _pixels(films: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    return {film["file"]: film["pixels"] for film in films if "pixels" in film}  # older results have none
 
 
 def with_copies_reviewed(exams: Sequence[ExamFiles], outcomes: Sequence[Outcome]) -> list[Outcome]:
     """Have those examinations reviewed whose films are given twice: no two exposures are alike to the last bit.
+
+    Of their pixels; the files may say something else.
 
     Parameters
     ----------
@@ -168,7 +176,7 @@ def with_copies_reviewed(exams: Sequence[ExamFiles], outcomes: Sequence[Outcome]
     same: dict[str, list[tuple[int, str]]] = {}
     for k, (files, outcome) in enumerate(zip(exams, outcomes, strict=True)):
         for film in files.films if outcome.status != "failed" else ():
-            if not film.cage_only and (content := outcome.inputs.get(film.path.name)):
+            if not film.cage_only and (content := outcome.pixels.get(film.path.name)):
                 same.setdefault(content, []).append((k, film.path.name))
     findings: dict[int, list[Finding]] = {}
     for copies in same.values():
@@ -195,6 +203,7 @@ def _measure(task: Task, started: float) -> tuple[Rows, list[dict[str, Any]], li
     response = {reading.path: reading.response for reading in result.films}
     about = [
         {"file": film.path.name, "focus": focus, "rows": film.values.shape[0], "cols": film.values.shape[1], "bits": film.bits}
+        | {"pixels": sha256(film.values.tobytes()).hexdigest()}
         | {"pitch_mm": film.pitch_mm, "pitch_source": film.pitch_source, "response": response.get(film.path)}
         for film, focus in (*cage_films, *films)
     ]

@@ -42,8 +42,7 @@ class _Exam:
     hidden: list[HiddenMarker] = field(default_factory=list)
     missing: set[str] = field(default_factory=set)  # known markers that were not found
     unsure: set[str] = field(default_factory=set)  # names that may be second ones of a marker
-    note: str = ""  # what a reader should know though nothing is wrong
-    told: str = ""  # likewise, of its pairs
+    told: str = ""  # what a reader should know of its pairs though nothing is wrong
 
 
 def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) -> list[Rows]:
@@ -183,7 +182,9 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
     if exam.missing:  # of known segments: these may be they
         exam.unsure |= {exam.names[left[a]] for a in new}
     if earlier and not agreed and not doubtful.any() and len(new) >= UNRELATED:
-        exam.note = f"another object than in the earlier examinations: none of its {len(new)} markers is among theirs"
+        told = f"none of its {len(new)} markers is among those of earlier examinations: of another subject, or another object?"
+        exam.findings.append(("marker-mismatch", told))
+        exam.unsure |= {exam.names[left[a]] for a in new}
     elif earlier:
         known = {name for other in earlier for name in other.names if not split_name(name)[0]}
         second = {name for other in earlier for name in other.unsure}
@@ -276,7 +277,7 @@ def _renamed(exam: _Exam) -> Rows:
     markers = [row for row in markers if row["x_mm"] is not None or name_of(row) in given or not images]
     markers += [missing_row(about, name) for name in sorted(exam.missing, key=natural_key)]
     row = judged(exam.rows["exams"][0], exam.findings)
-    row["message"] = " | ".join(filter(None, [row["message"], exam.told, exam.note]))
+    row["message"] = " | ".join(filter(None, [row["message"], exam.told]))
     return {**exam.rows, "exams": [row], "images": images, "markers": markers}
 
 

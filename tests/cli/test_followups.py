@@ -229,6 +229,19 @@ def test_a_name_that_may_be_a_second_one_is_doubted_as_long_as_the_first_is_miss
     assert whole["exams"][0]["status"] == "ok"  # both at once are two
 
 
+def test_films_of_another_subject_are_reviewed_and_no_others() -> None:
+    rng = np.random.default_rng(4)
+    body, another = rng.normal(0, 20, (2, 10, 3))
+    first, foreign, again, last = follow_up(
+        [rows_of("1", body), rows_of("2", another), rows_of("3", body + 4), rows_of("4", another - 2)], None, Limits()
+    )
+    assert first["exams"][0]["status"] == again["exams"][0]["status"] == "ok"
+    assert (foreign["exams"][0]["status"], foreign["exams"][0]["reasons"]) == ("review", "marker-mismatch")
+    assert "another subject" in foreign["exams"][0]["message"]
+    assert last["exams"][0]["status"] == "review"  # as long as nobody has looked
+    assert not {row["marker"] for row in foreign["markers"] if row["x_mm"] is not None} & {row["marker"] for row in first["markers"]}
+
+
 def test_a_marker_that_only_some_of_its_group_would_name_is_loose() -> None:
     """Three of eight agreed with a moved marker of large errors; nothing was said of the others."""
     loose = 0

@@ -154,6 +154,17 @@ def test_a_film_given_for_two_examinations_is_reviewed_in_both(
     assert f"{subject}_20270101_f1.tif" in messages[exam]
 
 
+def test_copies_are_told_by_their_pixels(folder: Path, tmp_path: Path, other_film: Callable[[str, str], Path]) -> None:
+    copy = other_film(f"{FIRST}_f1.tif", f"{FIRST.partition('_')[0]}_20270101_f1.tif")
+    other_film(f"{FIRST}_f2.tif", f"{FIRST.partition('_')[0]}_20270101_f2.tif")
+    copy.write_bytes(copy.read_bytes() + b"another file")  # beyond what TIFF's tables point at
+    out = tmp_path / "out"
+    for _ in range(2):  # measured, and kept
+        assert run_app(["measure", str(folder), "-o", str(out)]) == 1
+        messages = dict(read(out, "exams").select("exam", "message").iter_rows())
+        assert f"{copy.name} is the same film as {FIRST}_f1.tif" in messages["20270101"]
+
+
 def test_films_without_pitch_fail_and_name_the_option(tmp_path: Path, exams: list[RenderedExamination]) -> None:
     folder, out = tmp_path / "bare", tmp_path / "out"
     exams[0].write(folder, with_pitch=False)
