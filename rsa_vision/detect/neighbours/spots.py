@@ -38,6 +38,7 @@ _STEPS, _LAST_STEPS = 6, 12
 _H = 0.02  # pixels, for derivatives by the spot
 _MOST_STEP_PX = 0.6
 _SHRINK = 0.9  # of the radius, which has taken some of the spread
+_TOGETHER = 0.5  # of what one alone must gain over two balls, for each of those that have company
 _BETTER = 0.5  # of what they left: less than that they leave with the spot
 
 
@@ -119,11 +120,12 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
         return nobody
     depth = np.abs(odd.depth)
     usual = np.median(np.abs(sure.depth)) if len(sure.depth) >= LEAST_KNOWN else np.sort(depth)[-COMPANY]
-    odd = odd.rows(depth > _FAINT * usual)
+    odd, clean = (of.rows(np.abs(of.depth) > _FAINT * usual) for of in (odd, clean))
     like = np.abs(np.log(odd.radius_px[:, None] / odd.radius_px)) < np.log(_LIKE)
     if like.sum(axis=1).max(initial=0) < COMPANY:
         return nobody
-    odd = odd.rows(like[like.sum(axis=1).argmax()])
+    like = like[like.sum(axis=1) >= COMPANY]
+    odd = odd.rows(like[(like @ np.abs(odd.depth)).argmax()])
     odd = odd.rows(np.argsort(-over_clutter(odd)))
     radius = float(np.median(odd.radius_px))
     half = half_size(radius, optics.sigma_px)
@@ -156,9 +158,11 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
         return np.asarray(shapes_of(optics, spot, dx, dy, fits.radius_px[[i]])[0][0])
 
     gain, apart = gain_over_two(film, fits, image, odd, sure, optics, noise, others)
-    if np.count_nonzero(better & (gain > LEAST_GAIN)) < COMPANY:
+    # pairs would have to lie the same way by chance, all of them: they are judged together, and none of them decides alone
+    told = better & (gain > 0)
+    if np.count_nonzero(told) < COMPANY or np.minimum(gain[told], LEAST_GAIN).sum() < _TOGETHER * COMPANY * LEAST_GAIN:
         return nobody
-    doubtful, may_be = gain < LEAST_GAIN, gain > -LEAST_GAIN
+    doubtful, may_be = gain < 0, gain > -LEAST_GAIN
     either = np.where(doubtful[:, None, None], apart[:, :, None] * apart[:, None], 0.0)
     return Drawn(fits.rows(may_be), spot, doubtful[may_be], (by_spot + either)[may_be])
 
