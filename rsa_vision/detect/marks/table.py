@@ -30,6 +30,7 @@ _NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnificatio
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
+_SEEN = 0.5  # of a doubtful misfit, that noise makes seldom
 _UNLIKE = 2.0  # times the misfit that is usual on the film
 _ROOM = 2.0  # standard deviations: nearer to an end of the range the mean of what is left of the noise is not that of the film
 
@@ -40,7 +41,9 @@ def what_is_left(balls: BallFits, usual: float, sigma_px: float, noise: NoiseMod
     left = misfit(under, noise, CHANCE)
     specks = balls.radius_px <= radii(sigma_px)[0]  # as small as a fit may be: how small they are is not known, nor what they are
     # what all of a film leave is an error of the model, which spares their middles; what is left of two in one comes on top of that
-    most = max(DOUBTFUL * MISFIT, _UNLIKE * float(np.median(left))) if len(left) >= COMPANY else DOUBTFUL * MISFIT
+    least = np.sqrt(CHANCE * noise.scatter(balls.n_core) * noise.variance_at(balls.background)) / np.maximum(np.abs(balls.depth), 1e-9)
+    told = left[least < _SEEN * DOUBTFUL * MISFIT]  # on fainter ones noise hides it
+    most = max(DOUBTFUL * MISFIT, _UNLIKE * float(np.median(told))) if len(told) >= COMPANY else DOUBTFUL * MISFIT
     beside = np.sqrt(np.maximum(balls.chi2_ring - 1, 0.0) * noise.variance_at(balls.background)) / np.maximum(np.abs(balls.depth), 1e-9)
     return left, (left > most) | ((balls.chi2_ring > EDGE) & (beside > _SLIGHT)) | specks
 
