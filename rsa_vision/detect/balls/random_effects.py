@@ -40,6 +40,8 @@ class Common:
     proportion: Proportion
     differ: float  # of structure from window to window: standard deviation of its logarithm
     spot: Spot | None = None  # that draws them, if it is no Gaussian
+    more: float = 0.0  # variance of noise that a screen has spread, which is not stated, in units of that under balls
+    rough: float = 1.0  # variance that specks have by noise under balls, in units of that by noise as stated
 
     @property
     def rim_px(self) -> float:

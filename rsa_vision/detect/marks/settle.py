@@ -11,7 +11,8 @@ estimator, held over the free places, shows what errors are left.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.find import CHANCE
 from rsa_vision.detect.balls.fits import BallFits, uneven_white
 from rsa_vision.detect.balls.focal_spot import shapes_of
-from rsa_vision.detect.balls.quanta import ENOUGH, left_and_expected, shared_more
+from rsa_vision.detect.balls.quanta import ENOUGH, Left, left_over, shared_more, spread
 from rsa_vision.detect.balls.random_effects import Common, Solution, Windows, hold, solve, variance_of
 from rsa_vision.detect.balls.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.balls.usual import proportion, size_unlike, usual_size
@@ -34,7 +35,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import Beside
 from rsa_vision.detect.neighbours.edges import OF_SHIFT
 from rsa_vision.detect.neighbours.foreign import foreign, in_line, robust_residual
-from rsa_vision.detect.neighbours.specks import Specks, find_specks
+from rsa_vision.detect.neighbours.specks import Specks, find_specks, how_rough
 from rsa_vision.types import Bool, Float, Int
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
@@ -109,10 +110,51 @@ def settle(
     )
     clear_drawn = balls.rows(free & drawn & ~edged & (balls.chi2_ring < STRUCTURE))
     by_spot = replace(alike, size=usual_size(clear_drawn), spot=found.spot)
-    curve, single = curve_of(film), free & ~drawn
+    single = free & ~drawn
     usual = float(np.median(balls.chi2_uneven[single])) if single.any() else 1.0  # what all balls leave is no speck on one
+    fit = partial(_fitted, film, found, places, free, beside, structure, usual)
+    last = fit(alike, by_spot)
+    if any(specks.found.any() for specks in last.specks):  # or noise, of which there may be more under balls
+        alike, by_spot = (replace(common, rough=how_rough(last.specks)) for common in (alike, by_spot))
+        last = fit(alike, by_spot)
+    ratio = around_each(last.ratios, places, len(free), _least(noise), _QUARTILE)[:, 0]
+    if (more := shared_more(last.left)) > 0:
+        more /= max(1.0, float(np.median(ratio)))  # what is there beside balls as well multiplies all of it in the end
+        last = fit(*(replace(common, more=more) for common in (alike, by_spot)))
+    out = last.balls
+    out.covariance[:, :2, :2] += found.by_spot
+    by_size = np.zeros(len(free))
+    for kind, usual_ones in ((edged & ~drawn, clear), (edged & drawn, clear_drawn)):
+        by_size[kind] = size_unlike(balls.rows(kind), usual_ones)
+    return out, ratio, by_size, last.covered > MOST_COVERED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """The last fit of all balls of a film."""
+
+    balls: BallFits
+    ratios: list[Float]  # of squared errors at the places, (k, 1) for each size
+    covered: Float  # (n,), part of a ball on which something else lies
+    left: list[Left]  # by clear balls
+    specks: list[Specks]
+
+
+def _fitted(
+    film: NDArray[Any],
+    found: Balls,
+    places: list[Places],
+    free: Bool,
+    beside: Beside,
+    structure: Float,
+    usual: float,
+    alike: Common,
+    by_spot: Common,
+) -> _Fitted:
+    balls, edged, drawn = found.fits, found.edged, found.drawn
+    noise, under, curve = alike.noise, alike.under, curve_of(film)
     out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
-    left, fitted = list[tuple[Float, Float]](), list[tuple[Int, Float, Float, int]]()
+    left, every, louder, stayed = list[Left](), list[Specks](), list[Float](), np.ones(len(free), bool)
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
         for batch, common in _batches(drawn[these.balls], alike, by_spot):
@@ -120,7 +162,8 @@ def settle(
             windows = _without_others(_windows(film, balls, part, these.half, beside, noise), edged[part], common)
             solution = solve(windows, known, structure[part], common)
             excess = np.maximum(under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
-            specks = find_specks(solution, solution.radius_px + common.rim_px, windows.fits.depth, excess, 2 * these.half + 1, noise)
+            specks = find_specks(solution, solution.radius_px + common.rim_px, windows.fits.depth, excess, 2 * these.half + 1, common)
+            every.append(specks)
             fits = _fits(windows, solution, specks, known, common)
             better = (balls.chi2_uneven[part] - fits.chi2_uneven) / noise.scatter(fits.n_core)
             covered[part] = windows.covered
@@ -137,12 +180,18 @@ def settle(
             fits.covariance[edged[part], :2, :2] *= 1 - _OF_EDGE
             fits.covariance[edged[part], :2, :2] += _OF_EDGE * out.covariance[part[edged[part]], :2, :2]
             out = _put(out, part, fits, moved)
+            stayed[part[moved]] = False
+            if common.more:
+                estimated = solution.estimator, solution.weight, 2 * these.half + 1
+                all_of_it, stated = (
+                    np.trace(_of_noise(*estimated, told), axis1=1, axis2=2) for told in (common, replace(common, more=0.0))
+                )
+                louder.append(all_of_it / stated)
             described = (fits.chi2_ring < _UNEVEN) & (fits.chi2_core < _DESCRIBED)
             clear_ones = np.flatnonzero(moved & described & (fits.valid_fraction > _WHOLE))
-            if common.spot is None and len(clear_ones) and sum(len(of) for of, _ in left) < ENOUGH:
-                left.append(left_and_expected(solution, clear_ones, fits.background[clear_ones], known, these.half, common))
-            if moved.any():
-                fitted.append((part[moved], solution.estimator[moved], solution.weight[moved], 2 * these.half + 1))
+            if common.spot is None and len(clear_ones) and sum(len(of.found) for of in left) < ENOUGH:
+                of = fits.background[clear_ones], specks.found[clear_ones]
+                left.append(left_over(solution, clear_ones, *of, known, these.half, common))
             both[~crossed] = 0.0
             stay = free[part] & ~moved
             out.covariance[part[stay], :2, :2] += (both + hidden)[stay]
@@ -150,17 +199,9 @@ def settle(
             by_background, near = solution.estimator * solution.shade, np.searchsorted(batch, these.near[mine])
             errors[mine, 0] = _held_over(these.values[mine], near, by_background, known, structure[part], noise)
         ratios.append(errors)
-    more = shared_more(left)
-    if more > 1:
-        others = np.setdiff1d(np.arange(len(free)), np.concatenate([part for part, *_ in fitted]))
-        out.covariance[others] *= more
-        for part, estimator, weight, side in fitted:
-            out.covariance[part, :2, :2] += (more - 1) * _of_noise(estimator, weight, side, alike)
-    out.covariance[:, :2, :2] += found.by_spot
-    by_size = np.zeros(len(free))
-    for kind, usual_ones in ((edged & ~drawn, clear), (edged & drawn, clear_drawn)):
-        by_size[kind] = size_unlike(balls.rows(kind), usual_ones)
-    return out, around_each(ratios, places, len(free), _least(noise), _QUARTILE)[:, 0], by_size, covered > MOST_COVERED
+    if louder:
+        out.covariance[stayed] *= np.median(np.concatenate(louder))
+    return _Fitted(out, ratios, covered, left, every)
 
 
 def _batches(drawn: Bool, alike: Common, by_spot: Common) -> Iterator[tuple[Int, Common]]:
@@ -247,7 +288,10 @@ def _fits(windows: Windows, found: Solution, specks: Specks, known: Modes, commo
 def _of_noise(estimator: Float, weight: Float, side: int, common: Common) -> Float:
     """Covariance of what an estimator makes of noise."""
     by_noise = (estimator / np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]).reshape(-1, 2, side, side)
-    return np.asarray(common.under * influence_covariance(by_noise, common.noise.correlation))
+    covariance = influence_covariance(by_noise, common.noise.correlation)
+    if common.more:
+        covariance = covariance + common.more * influence_covariance(by_noise, spread(common.noise, common.optics).correlation)
+    return np.asarray(common.under * covariance)
 
 
 def _hidden(windows: Windows, found: Solution, curve: Curve, common: Common) -> Float:

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from rsa_vision.detect.balls.fits import mirrored
-from rsa_vision.detect.balls.random_effects import Solution
+from rsa_vision.detect.balls.random_effects import Common, Solution
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.whitening import whiten, whiten_rows
-from rsa_vision.types import Float
+from rsa_vision.types import Bool, Float
 
 _SPREADS_PX: Final = (1.0, 1.6)  # of dust as scanners draw it; half as much and twice as much are found as well
 _REACH: Final = 4.0  # such spreads
@@ -25,6 +25,7 @@ _SURE: Final = 4.5  # standard deviations that none of a film's places reaches b
 _SHARE: Final = 0.5  # of the significance there is before anything else is fitted anew
 _LEAST: Final = 1 / 3  # of a speck, that the fit does not take for something else: with less nothing is known of it
 _HEIGHT: Final = (0.03, 0.5)  # of the ball's depth, half of a speck's: models of balls are no truer, and specks no higher than balls
+_LEAST_BALLS: Final = 8  # that tell something of noise
 _NOTHING: Final = 1e-30
 
 
@@ -40,14 +41,30 @@ class Specks:
         Of that.
     image : ndarray of shape (n, pixels)
         To be taken from what is left of the windows.
+    energy, kept : ndarray of shape (n,)
+        Variance that specks have at the places of a ball, in units of that by noise as stated which has not been through the fit, and the
+        part of it that fits leave, where it was calculated; else NaN.
     """
 
     shift_px: Float
     covariance: Float
     image: Float
+    energy: Float
+    kept: Float
+
+    @property
+    def found(self) -> Bool:
+        """Say on which balls there are specks, shape (n,)."""
+        return np.asarray(self.shift_px.any(axis=1))
 
 
-def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, side: int, noise: NoiseModel) -> Specks:
+def how_rough(specks: list[Specks]) -> float:
+    """Return the variance that specks have by noise under balls, in units of that by noise as stated; 1 where few balls tell."""
+    energy, kept = (np.concatenate(of) for of in zip(*((s.energy, s.kept) for s in specks), strict=True))
+    return float(np.median(energy) / np.nanmedian(kept)) if len(energy) >= _LEAST_BALLS else 1.0
+
+
+def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, side: int, common: Common) -> Specks:
     """Look for one speck on each ball.
 
     Parameters
@@ -60,24 +77,28 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
     excess : ndarray of shape (n,)
         Variance around the balls, in units of the noise.
     side : int
-    noise : NoiseModel
+    common : Common
 
     Returns
     -------
     Specks
     """
-    count, pixels = solution.residual.shape
-    out = Specks(np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros((count, pixels)))
+    (count, pixels), noise = solution.residual.shape, common.noise
+    out = Specks(np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros((count, pixels)), np.zeros(count), np.full(count, np.nan))
     root, seen = np.sqrt(solution.weight), solution.weight > 0
     rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1)
     opposite = mirrored(solution.local_px, side)
     near = np.hypot(cols - solution.local_px[:, :1], rows - solution.local_px[:, 1:]) < (rim_px + _BEYOND_PX)[:, None]
     near &= seen & np.take_along_axis(seen, opposite, 1)
+    area = np.maximum(near.sum(axis=1), 1)
     left = whiten_rows(whiten_rows(solution.residual * root, side, noise), side, noise) * root
-    best = _SURE * np.sqrt(excess)
+    by_noise = np.maximum(excess, common.rough)
+    best = _SURE * np.sqrt(by_noise)
     for spread_px in _SPREADS_PX:
         told, alone = _at_every_place(left, side, spread_px), _energy(spread_px, noise) * solution.weight
         odd = told - np.take_along_axis(told, opposite, 1)
+        square = np.divide(odd**2, 2 * alone, out=np.zeros_like(odd), where=near)
+        out.energy[:] += square.sum(axis=1) / (len(_SPREADS_PX) * area)
         likely = near & (np.abs(odd) > _SHARE * best[:, None] * np.sqrt(2 * alone))
         for i in np.flatnonzero(likely.any(axis=1)):
             place = np.flatnonzero(near[i])
@@ -89,6 +110,7 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
             both = 2 * np.sqrt(alone[i, place] * alone[i, across]) * np.exp(-apart / (4 * spread_px**2))
             both = alone[i, place] + alone[i, across] - both
             own = np.maximum(both - (taken * fitted).sum(axis=0), _NOTHING)
+            out.kept[i] = np.mean(own / (2 * alone[i, place]))
             height = odd[i, place] / own
             of_ball = np.abs(height / depth[i])
             possible = (own > _LEAST * both) & (of_ball > _HEIGHT[0]) & (of_ball < _HEIGHT[1])
@@ -100,7 +122,7 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
             spots = np.zeros((1, pixels))
             spots[0, place[k]], spots[0, across[k]] = 1.0, -1.0
             out.shift_px[i] = -height[k] * fitted[:2, k]
-            out.covariance[i] = excess[i] / own[k] * np.outer(fitted[:2, k], fitted[:2, k])
+            out.covariance[i] = by_noise[i] / own[k] * np.outer(fitted[:2, k], fitted[:2, k])
             out.image[i] = height[k] * (_at_every_place(spots, side, spread_px)[0] - fitted[:, k] @ solution.images[i])
     return out
 
