@@ -65,10 +65,13 @@ def test_what_all_balls_of_a_film_leave_is_no_fault_of_one() -> None:
     left = np.full(len(truth), 0.06)  # of the depth: of a blur that is no Gaussian, where there is hardly any noise
     left[3] = 0.13
 
-    def with_misfit(part: np.ndarray, ring: float) -> np.ndarray:
-        chi2 = 1 + np.square(part * fits.depth) / noise.variance_at(fits.background)
-        return what_is_left(replace(fits, chi2_core=chi2, chi2_ring=np.full(len(part), ring)), 1.0, optics.sigma_px, noise)[1]
+    def with_misfit(part: np.ndarray, ring: float, shown: np.ndarray | float = 1.0) -> np.ndarray:
+        chi2 = 1 + np.square(part * shown * fits.depth) / noise.variance_at(fits.background)
+        balls = replace(fits, depth=shown * fits.depth, chi2_core=chi2, chi2_ring=np.full(len(part), ring))
+        return what_is_left(balls, 1.0, optics.sigma_px, noise)[1]
 
     assert np.flatnonzero(with_misfit(left, 1.0)).tolist() == [3]
+    faint = np.where(np.arange(len(truth)) < 6, 1.0, 0.02)  # most, on which noise hides what a few leave
+    assert np.flatnonzero(with_misfit(left, 1.0, faint)).tolist() == [3]
     assert with_misfit(np.full(len(truth), 0.01), 20.0).sum() == 0  # 20 times so little noise is no edge
     assert with_misfit(np.full(len(truth), 0.01), 1 + (0.05 * DEPTH * BACKGROUND / noise_sd) ** 2).all()

@@ -17,6 +17,7 @@ _OUTLIER = 3.0
 _FEW = 0.25  # clear balls to one that is fitted with an edge, from which they do not tell which sizes are usual
 _APART = 1.15  # ratio of radii of two kinds
 _LEAST_SIZES = 3  # balls that tell which sizes there are
+_COMPANY = 5  # others of its size: nothing beside a ball makes it by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +98,19 @@ def size_unlike(balls: BallFits, clear: BallFits) -> Float:
     """Return by how much the radii of balls differ from the nearest ones of clear balls, squared, beyond what errors explain; shape (n,).
 
     What pulls at a radius, as a corner or a second edge beside a ball does, pulls at its centre as much. Where clear balls are few, as
-    those in nearly saturated film beside a limb full of structure, what most of the others are like is usual as well.
+    those in nearly saturated film beside a limb full of structure, what most of the others are like is usual as well; and so is a size that
+    several others share, as balls that a focal spot draws do.
     """
     if len(clear.depth) < _LEAST_SIZES:
         return np.zeros(len(balls.depth))
-    gap = np.square(balls.radius_px[:, None] - clear.radius_px)
-    more = np.maximum(gap - balls.covariance[:, None, 2, 2] - clear.covariance[:, 2, 2], 0.0).min(axis=1)
+
+    def apart(others: BallFits) -> Float:
+        gap = np.square(balls.radius_px[:, None] - others.radius_px) - balls.covariance[:, None, 2, 2] - others.covariance[:, 2, 2]
+        return np.sort(np.maximum(gap, 0.0), axis=1)
+
+    more = apart(clear)[:, 0]
+    if len(balls.depth) > _COMPANY:  # no edges pull so many by the same
+        more = np.minimum(more, apart(balls)[:, _COMPANY])
     if len(clear.depth) < _FEW * len(balls.depth):
         gap = np.square(balls.radius_px - np.median(balls.radius_px))
         more = np.minimum(more, np.maximum(gap - balls.covariance[:, 2, 2], 0.0))

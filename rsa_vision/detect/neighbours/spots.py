@@ -38,7 +38,7 @@ _STEPS, _LAST_STEPS = 6, 12
 _H = 0.02  # pixels, for derivatives by the spot
 _MOST_STEP_PX = 0.6
 _SHRINK = 0.9  # of the radius, which has taken some of the spread
-_TOGETHER = 0.5  # of what one alone must gain over two balls, for each of those that have company
+_TOGETHER = 0.25  # of what one alone must gain over two balls: of pairs that lie alike by chance in one of a hundred ways each loses nine
 _BETTER = 0.5  # of what they left: less than that they leave with the spot
 
 
