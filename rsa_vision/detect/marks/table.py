@@ -42,7 +42,8 @@ def what_is_left(balls: BallFits, usual: float, sigma_px: float, noise: NoiseMod
     specks = balls.radius_px <= radii(sigma_px)[0]  # as small as a fit may be: how small they are is not known, nor what they are
     # what all of a film leave is an error of the model, which spares their middles; what is left of two in one comes on top of that
     least = np.sqrt(CHANCE * noise.scatter(balls.n_core) * noise.variance_at(balls.background)) / np.maximum(np.abs(balls.depth), 1e-9)
-    told = left[least < _SEEN * DOUBTFUL * MISFIT]  # on fainter ones noise hides it
+    seen = least < _SEEN * DOUBTFUL * MISFIT  # on fainter ones noise hides it
+    told = left[seen] if np.count_nonzero(seen) >= COMPANY else left
     most = max(DOUBTFUL * MISFIT, _UNLIKE * float(np.median(told))) if len(told) >= COMPANY else DOUBTFUL * MISFIT
     beside = np.sqrt(np.maximum(balls.chi2_ring - 1, 0.0) * noise.variance_at(balls.background)) / np.maximum(np.abs(balls.depth), 1e-9)
     return left, (left > most) | ((balls.chi2_ring > EDGE) & (beside > _SLIGHT)) | specks
