@@ -15,6 +15,7 @@ from rsa_vision.types import Float, FocusSolution, Markers, Reconstruction
 Status = Literal["ok", "review", "failed"]
 
 BIRGE_LIMIT: Final = 4.0  # residuals four times as large as stated are no noise but another model: a bent film, a wrong mark, another cage
+_EXPLAINED: Final = "image errors and the cage's marks explain; how well these are known is `sd` in the cage file"
 BEND_SIGMA: Final = 3.0
 COMMON_SIGMA: Final = 3.0  # RMS of all crossing errors over their sd; they share the errors of the foci and do not average out
 STRETCH_LIMIT: Final = 0.035  # scanners differ by 1 % between rows and columns; the builds of cage 1B by 5 %
@@ -118,12 +119,12 @@ def _judge_focus(focus: FocusSolution, nominal_mm: Mapping[int, Sequence[float]]
         largest = f"{focus.fiducial_max_um:.0f} um (limit {limits.fiducial_um:.0f})"
         findings.append(("fiducial-residual", f"{name}: a fiducial mark is off by {largest}"))
     elif focus.fiducial_birge > BIRGE_LIMIT:
-        findings.append(("fiducial-residual", f"{name}: fiducial residuals {focus.fiducial_birge:.1f} times what image errors explain"))
+        findings.append(("fiducial-residual", f"{name}: fiducial residuals {focus.fiducial_birge:.1f} times what {_EXPLAINED}"))
     if not focus.line_max_um <= 1000 * limits.line_mm:
         largest = f"{focus.line_max_um:.0f} um (limit {1000 * limits.line_mm:.0f})"
         findings.append(("control-residual", f"{name}: the line of a control point misses the focus by {largest}"))
     elif focus.control_birge > BIRGE_LIMIT:
-        findings.append(("control-residual", f"{name}: control residuals {focus.control_birge:.1f} times what image errors explain"))
+        findings.append(("control-residual", f"{name}: control residuals {focus.control_birge:.1f} times what {_EXPLAINED}"))
     away = float(np.linalg.norm(focus.position_mm - np.asarray(nominal_mm[focus.focus])))
     if not away <= limits.focus_mm:
         findings.append(("focus-far", f"{name}: {away:.0f} mm from nominal (limit {limits.focus_mm:.0f})"))
