@@ -27,6 +27,7 @@ from rsa_vision.types import Bool, Float, Int
 ENOUGH = 60  # balls that are asked
 _DRAWS = 2  # of noise for each
 _LEAST = 4  # balls that tell something
+_CAUTION = 1.8  # standard deviations of chance: no more than these is not believed, and what is more not wholly
 _NEAR = 1.2  # blurs: width of the neighbourhoods
 _SPREAD = 0.7  # blurs: what a screen spreads has not been through the focal spot, which makes the other half of the variance
 
@@ -117,9 +118,10 @@ def shared_more(told: list[Left]) -> float:
     more = float(np.mean(found[..., seen]) / np.mean(mean[seen])) - 1
     scatter = float(np.std(expected[:, seen] / mean[seen])) * np.sqrt(_DRAWS / (_DRAWS - 1))
     chance = scatter * np.sqrt((1 + 1 / _DRAWS) / np.count_nonzero(seen))
-    if more <= chance:
+    by_chance = _CAUTION * chance
+    if more <= by_chance:
         return 0.0
-    return float((more - chance**2 / more) * np.mean(mean[seen]) / np.mean(shared[:, seen]))
+    return float((more - by_chance**2 / more) * np.mean(mean[seen]) / np.mean(shared[:, seen]))
 
 
 def _drawn(noise: NoiseModel, count: int, side: int) -> Float:
