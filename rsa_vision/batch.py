@@ -152,7 +152,7 @@ def measure_task(task: Task) -> Outcome:
 
 
 def _pixels(films: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    return {film["file"]: film["pixels"] for film in films if "pixels" in film}  # older results have none
+    return {film["file"]: film["pixels"] for film in films if "pixels" in film}
 
 
 def with_copies_reviewed(exams: Sequence[ExamFiles], outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -176,8 +176,9 @@ def with_copies_reviewed(exams: Sequence[ExamFiles], outcomes: Sequence[Outcome]
     same: dict[str, list[tuple[int, str]]] = {}
     for k, (files, outcome) in enumerate(zip(exams, outcomes, strict=True)):
         for film in files.films if outcome.status != "failed" else ():
-            if not film.cage_only and (content := outcome.pixels.get(film.path.name)):
-                same.setdefault(content, []).append((k, film.path.name))
+            name = film.path.name
+            if not film.cage_only and (content := outcome.pixels.get(name) or outcome.inputs.get(name)):  # older results have files only
+                same.setdefault(content, []).append((k, name))
     findings: dict[int, list[Finding]] = {}
     for copies in same.values():
         for i, (k, name) in enumerate(copies if len(copies) > 1 else ()):

@@ -179,12 +179,12 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
     for a in new:
         used += 1
         exam.names[left[a]] = f"P{used:02d}"
-    if exam.missing:  # of known segments: these may be they
+    unrelated = bool(earlier) and not agreed and not doubtful.any() and len(new) >= UNRELATED
+    if exam.missing or unrelated:  # they may be those of known segments, or of nobody that was seen before
         exam.unsure |= {exam.names[left[a]] for a in new}
-    if earlier and not agreed and not doubtful.any() and len(new) >= UNRELATED:
+    if unrelated:
         told = f"none of its {len(new)} markers is among those of earlier examinations: of another subject, or another object?"
         exam.findings.append(("marker-mismatch", told))
-        exam.unsure |= {exam.names[left[a]] for a in new}
     elif earlier:
         known = {name for other in earlier for name in other.names if not split_name(name)[0]}
         second = {name for other in earlier for name in other.unsure}
