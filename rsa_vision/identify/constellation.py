@@ -21,6 +21,7 @@ from rsa_vision.types import Bool, Float, Int
 
 FOUND: Final = 0.9  # probability that a marker of a known segment is among the points
 STRAY: Final = 3.0  # expected points that belong to nothing known, at least
+LOOSE: Final = 0.02  # probability that a marker found has moved in its bone
 LOOSE_MM: Final = 3.0  # how far a marker may have moved in its bone and still be known by its place
 LOOSE_SIGMA: Final = 4.0  # residual of a marker that has moved
 NEGLIGIBLE: Final = -7.0  # log odds below which an assignment is not counted
@@ -71,16 +72,20 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -
     """
     volume = volume_mm3(points)
     stray = STRAY + max(0, len(points) - sum(map(len, segments)))
-    rivals = [(index, odds, pairs) for index, body in enumerate(segments) for odds, pairs in likely_groups(body, points, volume, stray)]
-    owner, groups = [index for index, _, _ in rivals], [pairs for _, _, pairs in rivals]
-    claims = [(*(a for _, a in pairs), len(points) + index) for index, _, pairs in rivals]
-    packing = pack(claims, np.array([odds for _, odds, _ in rivals]))
+    rivals = [
+        (index, odds, rigid, loose)
+        for index, body in enumerate(segments)
+        for odds, rigid, loose in _with_one_loose(body, points, likely_groups(body, points, volume, stray), volume / stray)
+    ]
+    claims = [(*(a for _, a in (*rigid, *loose)), len(points) + index) for index, _, rigid, loose in rivals]
+    packing = pack(claims, np.array([odds for _, odds, _, _ in rivals]))
     chances = np.nan_to_num(packing.posterior)
     known = []
     for index, segment in enumerate(segments):
-        mine = [g for g in range(len(groups)) if owner[g] == index]
-        best = next((groups[g] for g in mine if packing.chosen[g]), ())
-        known.append(_known(segment, points, best, _names([groups[g] for g in mine], chances[mine]), posterior))
+        mine = [g for g, rival in enumerate(rivals) if rival[0] == index]
+        names = _names([(*rivals[g][2], *rivals[g][3]) for g in mine], chances[mine])
+        rigid, loose = next((rivals[g][2:] for g in mine if packing.chosen[g]), ((), ()))
+        known.append(_known(segment, points, rigid, loose, names, posterior))
     return _with_loose(segments, points, known)
 
 
@@ -102,6 +107,25 @@ def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) ->
     """
     found = candidate_poses(segment, points, float(np.log(volume / stray)))
     return _sorted([(log_odds(len(segment), placement, pairs, volume, stray), pairs) for pairs, placement in found])[:MOST_RIVALS]
+
+
+def _with_one_loose(
+    segment: Cloud, points: Cloud, groups: Sequence[tuple[float, Pairs]], volume_of_a_stray: float
+) -> list[tuple[float, Pairs, Pairs]]:
+    """Add to assignments those with one marker more, that has moved in its bone: its point lies anywhere near its place.
+
+    Without them a wrong assignment of all markers competes with the true one of those that have not moved, and with a stray point that
+    happens to lie where the marker that moved is missing.
+    """
+    gain = np.log(LOOSE * FOUND / (1 - FOUND) * volume_of_a_stray / (4 / 3 * np.pi * LOOSE_MM**3))
+    rivals: list[tuple[float, Pairs, Pairs]] = [(odds, pairs, ()) for odds, pairs in groups]
+    for odds, pairs in groups:
+        if (placement := place(segment, points, pairs)) is None:
+            continue
+        lost, free = _others(len(segment), dict(pairs).keys()), _others(len(points), dict(pairs).values())
+        away = np.linalg.norm(points.position_mm[free] - placement.predict(segment.position_mm[lost])[0][:, None], axis=-1)
+        rivals += [(odds + float(gain), pairs, ((int(lost[i]), int(free[a])),)) for i, a in np.argwhere(away < LOOSE_MM).tolist()]
+    return sorted(rivals, key=lambda rival: (-rival[0], rival[1:]))[:MOST_RIVALS]
 
 
 def log_odds(n: int, placement: Placement, pairs: Pairs, volume: float, stray: float) -> float:
@@ -248,20 +272,21 @@ def _names(groups: Sequence[Pairs], chances: Float) -> dict[tuple[int, int], flo
     return names
 
 
-def _known(segment: Cloud, points: Cloud, best: Pairs, names: dict[tuple[int, int], float], posterior: float) -> Known:
-    pairs = tuple(pair for pair in best if names[pair] >= posterior)
-    doubtful = tuple(pair for pair in best if names[pair] < posterior)
+def _known(segment: Cloud, points: Cloud, rigid: Pairs, loose: Pairs, names: dict[tuple[int, int], float], posterior: float) -> Known:
+    pairs = tuple(pair for pair in rigid if names[pair] >= posterior)
+    doubtful = tuple(pair for pair in rigid if names[pair] < posterior)
     placement = place(segment, points, pairs) if len(pairs) >= LEAST_POINTS else None
     if placement is None:
-        pairs, doubtful = (), best
+        pairs, doubtful, loose = (), rigid, ()
     moved = () if placement is None else tuple(p for p, sigma in zip(pairs, placement.sigmas, strict=True) if sigma > LOOSE_SIGMA)
-    named = {i for i, _ in best}
-    return Known(pairs, doubtful, moved, tuple(i for i in range(len(segment)) if i not in named), placement)
+    moved += tuple(pair for pair in loose if names[pair] >= posterior)
+    named = {i for i, _ in (*rigid, *moved)}
+    return Known(pairs, doubtful, tuple(sorted(moved)), tuple(i for i in range(len(segment)) if i not in named), placement)
 
 
 def _with_loose(segments: Sequence[Cloud], points: Cloud, known: list[Known]) -> list[Known]:
     """Add markers that have moved in their bone: a point that nothing else explains, alone near the place of one missing marker alone."""
-    taken = {a for one in known for _, a in (*one.pairs, *one.doubtful)}
+    taken = {a for one in known for _, a in (*one.pairs, *one.doubtful, *one.loose)}
     free = np.array([a for a in range(len(points)) if a not in taken], dtype=np.int64)
     near: list[tuple[int, int, int]] = []
     for index, (segment, one) in enumerate(zip(segments, known, strict=True)):

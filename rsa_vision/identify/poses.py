@@ -16,8 +16,11 @@ from rsa_vision.geometry.rigid import COLLINEAR, LEAST_POINTS, fit_rigid_many
 from rsa_vision.types import Float, Int, Table
 
 TOLERANCE_MM: Final = 0.05  # sd of a coordinate beyond the stated errors: bone is alive, markers are not exactly where they were
-SCALES: Final = (1.0, 2.0, 4.0)  # stated errors may be that much too small
-SCALE_PRIOR: Final = (0.9, 0.09, 0.01)
+STILL_MM: Final = 0.01  # and of markers that have not moved at all
+SCALES: Final = (1.0, 1.0, 2.0, 4.0)  # stated errors may be that much too small,
+BEYOND_MM: Final = (STILL_MM, TOLERANCE_MM, TOLERANCE_MM, TOLERANCE_MM)  # with as much beyond them,
+ERROR_PRIOR: Final = (0.5, 0.45, 0.045, 0.005)  # and so likely before the residuals are seen
+USUAL: Final = 1  # the errors to which residuals are compared; poses are told with these or larger ones, never with those of the still
 GATE: Final = 4.5  # sd within which a distance, or a marker from its predicted place, may belong
 GATE_SCALE: Final = 2.0  # with the errors so much larger than stated
 ROTATION_RAD: Final = 1.0  # sd to which an undetermined rotation is known
@@ -97,7 +100,9 @@ def place(body: Cloud, points: Cloud, pairs: Pairs) -> Placement | None:
     Notes
     -----
     Least squares weighted by the covariances of both sides and :data:`TOLERANCE_MM`, linearised about the unweighted solution. With
-    residuals r, covariances S and derivatives J by the pose, ``log ∫ ∏ N(r; S) dθ = Σ log N(r̂; S) + 3 log 2π − ½ log |JᵀS⁻¹J|``.
+    residuals r, covariances S and derivatives J by the pose, ``log ∫ ∏ N(r; S) dθ = Σ log N(r̂; S) + 3 log 2π − ½ log |JᵀS⁻¹J|``, summed
+    over what errors may be (:data:`SCALES`, :data:`BEYOND_MM`): three markers that agree to their errors are more than four that agree to
+    the tolerance.
     """
     marks, hits = np.array(pairs).T
     return place_many(body, points, marks[None], hits[None])[0]
@@ -111,7 +116,8 @@ def place_many(body: Cloud, points: Cloud, marks: Int, hits: Int) -> list[Placem
     rotation, residual, centre = start.rotation, start.residual_mm, start.target_cog_mm
     jacobian = pose_jacobian(start.turned_mm)
     stated = points.covariance_mm2[hits] + rotation[:, None] @ body.covariance_mm2[marks] @ rotation[:, None].swapaxes(-1, -2)
-    every = np.array(SCALES)[:, None, None] ** 2 * stated[:, :, None] + TOLERANCE_MM**2 * np.eye(3)  # (t, k, s, 3, 3)
+    scales, beyond_mm = np.array(SCALES)[:, None, None], np.array(BEYOND_MM)[:, None, None]
+    every = scales**2 * stated[:, :, None] + beyond_mm**2 * np.eye(3)  # (t, k, s, 3, 3)
     weight = np.linalg.inv(every)
     by_pose = weight @ jacobian[:, :, None]  # (t, k, s, 3, 6)
     normal = (jacobian[:, :, None].swapaxes(-1, -2) @ by_pose).sum(axis=1) + np.diag([ROTATION_RAD**-2] * 3 + [0.0] * 3)  # (t, s, 6, 6)
@@ -122,10 +128,10 @@ def place_many(body: Cloud, points: Cloud, marks: Int, hits: Int) -> list[Placem
     squares = (left[..., None, :] @ weight @ left[..., None])[..., 0, 0]
     density = -0.5 * squares - 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(every)[1]
     log_likelihood = density.sum(axis=1) + 3 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(normal)[1]  # (t, s)
-    total = logsumexp(log_likelihood, axis=1, b=SCALE_PRIOR)
-    best = np.argmax(log_likelihood + np.log(SCALE_PRIOR), axis=1)
-    leverage = np.trace(by_pose[:, :, 0] @ covariance[:, None, 0] @ jacobian.swapaxes(-1, -2), axis1=-2, axis2=-1) / 3
-    sigmas = np.sqrt(squares[:, :, 0] / 3 / np.maximum(1 - leverage, 1 / marks.shape[1]))
+    total = logsumexp(log_likelihood, axis=1, b=ERROR_PRIOR)
+    best = USUAL + np.argmax((log_likelihood + np.log(ERROR_PRIOR))[:, USUAL:], axis=1)
+    leverage = np.trace(by_pose[:, :, USUAL] @ covariance[:, None, USUAL] @ jacobian.swapaxes(-1, -2), axis1=-2, axis2=-1) / 3
+    sigmas = np.sqrt(squares[:, :, USUAL] / 3 / np.maximum(1 - leverage, 1 / marks.shape[1]))
     one = np.arange(len(marks))
     step, covariance = step[one, best], covariance[one, best]
     turn = rotation_by(step[:, :3])

@@ -9,11 +9,13 @@ from scipy.special import logsumexp
 
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.poses import (
+    BEYOND_MM,
+    ERROR_PRIOR,
     GATE_SCALE,
     ROTATION_RAD,
-    SCALE_PRIOR,
     SCALES,
     TOLERANCE_MM,
+    USUAL,
     Cloud,
     Pairs,
     Placement,
@@ -64,19 +66,19 @@ def place_with_rays(
         residual = [*(points.position_mm[theirs] - moved[:k]), *np.einsum("nij,nj->ni", across, target - moved[k:])]
         design = [*jacobian[:k], *(across @ jacobian[k:])]
         stated = [*(points.covariance_mm2[theirs] + own[:k]), *(across @ (at_ray + own[k:]) @ across.swapaxes(1, 2))]
-        step, _, _, _ = _solved(residual, design, stated, 1.0)
+        step, _, _, _ = _solved(residual, design, stated, 1.0, TOLERANCE_MM)
         turn = rotation_by(step[:3])
         rotation, translation = turn @ rotation, np.asarray(turn @ (translation - centre) + centre + step[3:], np.float64)
         if np.linalg.norm(step) < 1e-6:
             break
         if not np.linalg.norm(step[:3]) < 1.0:
             return None
-    solved = [_solved(residual, design, stated, scale) for scale in SCALES]
+    solved = [_solved(residual, design, stated, *errors) for errors in zip(SCALES, BEYOND_MM, strict=True)]
     log_likelihood = np.array([density + 3 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(normal)[1] for _, normal, density, _ in solved])
-    best = int(np.argmax(log_likelihood + np.log(SCALE_PRIOR)))
-    total = float(logsumexp(log_likelihood, b=SCALE_PRIOR))
+    best = USUAL + int(np.argmax((log_likelihood + np.log(ERROR_PRIOR))[USUAL:]))
+    total = float(logsumexp(log_likelihood, b=ERROR_PRIOR))
     covariance = np.asarray(np.linalg.inv(solved[best][1]), np.float64)
-    return Placement(rotation, translation, centre, covariance, total, solved[0][3])
+    return Placement(rotation, translation, centre, covariance, total, solved[USUAL][3])
 
 
 def off_rays(body: Cloud, rays: RayBundle, placement: Placement) -> tuple[Float, Float]:
@@ -110,11 +112,13 @@ def _across(direction: Float) -> Float:
     return np.stack([first, np.cross(direction, first)], axis=1)
 
 
-def _solved(residual: list[Float], design: list[Float], stated: list[Float], scale: float) -> tuple[Float, Float, float, Float]:
+def _solved(
+    residual: list[Float], design: list[Float], stated: list[Float], scale: float, beyond_mm: float
+) -> tuple[Float, Float, float, Float]:
     """Return the step, the normal matrix, the log density after it, and the residuals in units of their sd."""
     normal = np.diag([ROTATION_RAD**-2 * 1e-3] * 3 + [0.0] * 3)
     right = np.zeros(6)
-    weights = [np.linalg.inv(scale**2 * s + TOLERANCE_MM**2 * np.eye(len(s))) for s in stated]
+    weights = [np.linalg.inv(scale**2 * s + beyond_mm**2 * np.eye(len(s))) for s in stated]
     for r, d, w in zip(residual, design, weights, strict=True):
         normal += d.T @ w @ d
         right += d.T @ w @ r
