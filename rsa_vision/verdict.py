@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Final, Literal
 
 import numpy as np
 
 from rsa_vision.flags import REASONS, MarkerFlag
 from rsa_vision.settings import Limits
-from rsa_vision.types import Float, FocusSolution, Markers, Reconstruction
+from rsa_vision.types import Float, FocusSolution, ImagePoints, Markers, Reconstruction
 
 Status = Literal["ok", "review", "failed"]
 
@@ -19,6 +20,7 @@ _EXPLAINED: Final = "image errors and the cage's marks explain; how well these a
 BEND_SIGMA: Final = 3.0
 COMMON_SIGMA: Final = 3.0  # RMS of all crossing errors over their sd; they share the errors of the foci and do not average out
 STRETCH_LIMIT: Final = 0.035  # scanners differ by 1 % between rows and columns; the builds of cage 1B by 5 %
+LEAST_ALIKE, ALIKE_PX = 3, 2.0  # markers that lie alike on two films, and by how much their images may differ
 FAILURES: Final = frozenset(
     {"film-unreadable", "film-format", "film-name", "film-missing", "film-unexpected", "pitch-missing", "no-markers", "cage-not-found"}
     | {"geometry", "calibration-invalid", "cage-film-differs", "internal", "timeout"}
@@ -74,7 +76,34 @@ def judge(reconstruction: Reconstruction, nominal_mm: Mapping[int, Sequence[floa
     with_cage = [focus for focus in reconstruction.foci if focus.focus in nominal_mm]
     findings = [finding for focus in with_cage for finding in _judge_focus(focus, nominal_mm, limits)]
     findings += [finding for focus in with_cage for finding in _judge_images(reconstruction, focus.focus)]
-    return findings + _judge_markers(reconstruction.markers, limits)
+    return findings + _judge_films(reconstruction.points) + _judge_markers(reconstruction.markers, limits)
+
+
+def _judge_films(points: ImagePoints) -> list[Finding]:
+    """Find films that show one picture: scanned twice, a film names the marks of two equal cassettes and crosses in one plane."""
+    findings: list[Finding] = []
+    named = points.rows(points.role != "unassigned")
+    for one, other in combinations(sorted(set(named.focus[named.role == "object"].tolist())), 2):
+        mine, theirs = (named.rows(named.focus == focus) for focus in (one, other))
+        if mine.film[0] != theirs.film[0] and _is_one_picture(mine, theirs):
+            findings.append(("film-duplicate", f"the films of focus {one} and {other} show one picture: was one scanned twice?"))
+    return findings
+
+
+def _is_one_picture(one: ImagePoints, other: ImagePoints) -> bool:
+    """Say whether images of markers and marks lie alike on two films, but for a turn and a shift: foci apart show depths differently."""
+    objects = [{str(p.number[i]): complex(*p.position_px[i]) for i in np.flatnonzero(p.role == "object")} for p in (one, other)]
+    both = sorted(objects[0].keys() & objects[1].keys())
+    if len(both) < LEAST_ALIKE:
+        return False
+    start, end = (np.array([of[number] for number in both]) for of in objects)
+    design = np.column_stack([start, np.ones(len(start))])
+    turn = np.linalg.lstsq(design, end, rcond=None)[0]
+    if np.abs(design @ turn - end).max() > ALIKE_PX:
+        return False
+    moved, there = (p.position_px @ [1, 1j] for p in (one, other))
+    away = np.abs((turn[0] * moved + turn[1])[:, None] - there).min(axis=1)
+    return bool(np.median(away) < ALIKE_PX)
 
 
 def film_stretch(plane_from_film: Float, position_px: Float, pitch_mm: tuple[float, float]) -> float:

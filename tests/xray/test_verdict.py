@@ -6,7 +6,7 @@ import pytest
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.settings import Limits
 from rsa_vision.types import ImagePoints, Markers, Reconstruction
-from rsa_vision.verdict import _judge_images, _judge_markers
+from rsa_vision.verdict import _judge_films, _judge_images, _judge_markers
 
 
 def markers(parallax_um: np.ndarray, sd_um: np.ndarray) -> Markers:
@@ -52,3 +52,26 @@ def test_control_points_that_mostly_overlap_others_are_reviewed(lapped: int, use
     reconstruction = Reconstruction(points, np.zeros((2 * n, 3)), np.zeros(2 * n), taken, (), nothing, nothing)
     assert [code for code, _ in _judge_images(reconstruction, 1)] == ["control-doubled"] * doubled
     assert not _judge_images(reconstruction, 2)
+
+
+@pytest.mark.parametrize(("what", "same"), [("scanned twice", True), ("flat object", False), ("deep object", False)])
+def test_one_film_scanned_twice_is_told_from_films_of_two_foci(what: str, same: bool) -> None:
+    rng = np.random.default_rng(1)
+    marks, objects = rng.uniform(0, 2000, (18, 2)), rng.uniform(600, 1400, (6, 2))
+    shift = {"scanned twice": np.zeros((24, 2)), "flat object": np.repeat([[50.0, 0], [0, 0]], [18, 6], axis=0)}
+    second = np.concatenate([marks, objects]) + shift.get(what, rng.normal(0, 30, (24, 2)))
+    turn = np.exp(0.02j)
+    turned = (second @ [1, 1j]) * turn + (30 - 12j)
+    px = np.concatenate([marks, objects, np.column_stack([turned.real, turned.imag])]) + rng.normal(0, 0.2, (48, 2))
+    roles, numbers = np.repeat(["fiducial", "control", "object"], [9, 9, 6]), np.arange(24).astype(str)
+    points = ImagePoints(
+        focus=np.repeat([1, 2], 24),
+        role=np.tile(roles, 2),
+        number=np.concatenate([numbers, np.arange(100, 118).astype(str), numbers[18:]]),
+        shape=np.full(48, "ball"),
+        position_px=px,
+        covariance_px2=np.tile(np.eye(2), (48, 1, 1)),
+        flags=np.zeros(48, int),
+        film=np.repeat([0, 1], 24),
+    )
+    assert [code for code, _ in _judge_films(points)] == ["film-duplicate"] * same
