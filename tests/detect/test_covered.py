@@ -148,6 +148,25 @@ def test_balls_over_arms_say_so_and_how_far_off_they_may_be() -> None:
     assert max(z) < 4.5
 
 
+def test_tees_under_balls_are_measured_by_what_is_seen_of_them() -> None:
+    """Balls over the ends of arms drew the tips along, by up to a pixel; two of three were flagged."""
+    rng = np.random.default_rng(20)
+    tips = tips_of(rng)
+    clear = light_past_tees(tips, np.ones(len(tips)))
+    rows, cols = (np.mgrid[0 : SIDE * 3, 0 : SIDE * 3] + 0.5) / 3 - 0.5
+    chord = np.zeros(rows.shape)
+    for k, tip in enumerate(tips[::3]):
+        at = tip + rng.uniform(0.8, 1.05) * LENGTH_PX * np.array([np.cos(ARMS[k % 3]), -np.sin(ARMS[k % 3])]) + rng.uniform(-2, 2, 2)
+        chord += 2 * np.sqrt(np.maximum(4.0**2 - (cols - at[0]) ** 2 - (rows - at[1]) ** 2, 0)) * PITCH_MM
+    clear *= np.exp(-MU_PER_MM * chord).reshape(SIDE, 3, SIDE, 3).mean((1, 3))
+    found = detect_markers(exposed(clear, rng), bits=16).images
+    found = found.rows(found.shape == "tee")
+    clear_ones = found.position_px[(found.flags & ~int(MarkerFlag.OVERLAP)) == 0]
+    seen = [k for k, tip in enumerate(tips) if np.hypot(*(clear_ones - tip).T).min() < 1]
+    check(found, tips, seen)
+    assert len(seen) >= len(tips) - 1
+
+
 @pytest.mark.parametrize("faint", [0.15, 0.4])
 def test_a_faint_one_that_a_clear_one_touches(faint: float) -> None:
     rng = np.random.default_rng(4)

@@ -39,13 +39,21 @@ _ALIKE, _WIDE = 0.05, 0.2  # radians and parts by which tees of a film differ; h
 
 
 def find_covered(
-    film: NDArray[Any], known: list[NeedleFit], strokes: Float, optics: Optics, noise: NoiseModel, faintest: float
+    film: NDArray[Any],
+    bare: NDArray[Any],
+    known: list[NeedleFit],
+    strokes: Float,
+    optics: Optics,
+    noise: NoiseModel,
+    faintest: float,
 ) -> tuple[NDArray[Any], list[NeedleFit]]:
     """Find tees of which something else hides a part.
 
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
+    bare : ndarray of shape (rows, cols)
+        The film, or as :func:`uncovered` returns it.
     known : list of NeedleFit
         Clean tees of the film, all that were found.
     strokes : ndarray of shape (n, 6)
@@ -61,9 +69,8 @@ def find_covered(
         NaN where something hides them.
     tees : list of NeedleFit
     """
-    by_size = sorted(known, key=lambda t: t.shape.length_px)
-    model, *ends = (by_size[part * (len(known) - 1) // 4] for part in (2, 1, 3))  # fiducial marks and control points may be of two sizes
-    bare, tees = film, list(known)
+    model, *ends = _sizes(known)
+    tees = list(known)
     for _ in range(_PASSES):
         before = len(tees)
         for start in _two_arms(film, strokes[:, :2], tees, model, optics):
@@ -81,6 +88,50 @@ def find_covered(
         if len(tees) == before:
             break
     return bare, tees[len(known) :]
+
+
+def uncovered(
+    film: NDArray[Any], known: list[NeedleFit], disturbed: list[NeedleFit], optics: Optics, noise: NoiseModel
+) -> tuple[NDArray[Any], list[NeedleFit | None]]:
+    """Fit tees again without what lies over a part of them.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    known : list of NeedleFit
+        Clean tees of the film, five or more.
+    disturbed : list of NeedleFit
+        Others.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    film : ndarray of shape (rows, cols)
+        NaN where something hides them.
+    tees : list of NeedleFit or None
+        Of each of them; None where most of its pixels agree with no tee like the others.
+    """
+    bare, tees = film, list[NeedleFit | None]()
+    for tee in disturbed:
+        bare = film.astype(np.float32) if bare is film else bare
+        others = others_beside(tee, [*known, *(t for t in disturbed if t is not tee)], optics)
+        starts = [replace(tee, shape=end.shape) for end in _sizes(known)[1:]]
+        tried = [_robust(film, bare, start, others, optics, noise) for start in starts]
+        fit, hidden = min(tried, key=lambda one: len(one[1][0]))
+        before, bare[hidden] = bare[hidden], np.nan
+        if _is_one(fit, _seen(bare, fit, optics)) and _is_like(fit, known) and math.dist(fit.position_px, tee.position_px) < NEAREST_PX:
+            tees.append(fit)
+        else:
+            bare[hidden] = before
+            tees.append(None)
+    return bare, tees
+
+
+def _sizes(known: list[NeedleFit]) -> list[NeedleFit]:
+    """Return a tee of middle size, and two that stand for two sizes: fiducial marks and control points may be of two."""
+    by_size = sorted(known, key=lambda t: t.shape.length_px)
+    return [by_size[part * (len(known) - 1) // 4] for part in (2, 1, 3)]
 
 
 def _apart(fit: NeedleFit, tees: list[NeedleFit]) -> bool:

@@ -16,11 +16,11 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.covered import find_covered
+from rsa_vision.detect.needles.covered import find_covered, uncovered
 from rsa_vision.detect.needles.crossing import chi2_of, fit_crossing, moved, window_of
 from rsa_vision.detect.needles.edges import beside_edges, proportion_of
 from rsa_vision.detect.needles.ends import goes_on
-from rsa_vision.detect.needles.fits import explains, fit_needles
+from rsa_vision.detect.needles.fits import excess_of, explains, fit_needles
 from rsa_vision.detect.needles.optics import common_optics
 from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles.shared import fit_shared
@@ -44,6 +44,7 @@ _LEAST_PIXELS = 30  # under the arms: three arms of fewer fit anything
 _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms is worth asking for
 # by which tees of a set differ: logarithms of half width, which stands for depth, and of length, radians; part of them that do not more
 _ALIKE, _MOST_ALIKE = (0.35, 0.2, 0.15), 0.7
+_ODD = 1.5  # times what is left under most tees of a film, from which something lies over one
 _ASKED = 3  # cleanest tees that tell blur and taper
 _BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 GUESS = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
@@ -123,9 +124,10 @@ def _found_from(
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
+    bare, fitted, optics = _undisturbed(film, fitted, optics, noise)
     clean = [t for t in fitted if is_tee(t)]
     if len(clean) >= _LEAST_PARALLEL:
-        bare, more = find_covered(film, clean, strokes, optics, noise, _FAINTEST)
+        bare, more = find_covered(film, bare, clean, strokes, optics, noise, _FAINTEST)
         if more:
             rough = _apart([t for t in fitted if all(t is not c for c in clean)], more, NEAREST_PX)
             others = _apart(others, more, _SAME_JUNCTION * clean[0].shape.length_px)
@@ -133,6 +135,28 @@ def _found_from(
     slack = _BEFORE if len(clean) >= _LEAST_PARALLEL else 1.0  # of what is parallel to others, and as large, bone may leave more
     others += [replace(t, slants=None) for t in fitted if not is_tee(t, slack)]
     return [t for t in fitted if is_tee(t, slack)], [t for t in others if is_tee(t, slack=ROUGH)], optics
+
+
+def _undisturbed(
+    film: NDArray[Any], fitted: list[NeedleFit], optics: Optics, noise: NoiseModel
+) -> tuple[NDArray[Any], list[NeedleFit], Optics]:
+    """Fit all again without what lies over some, under which much more is left than under most: a bead on an arm pulls at the tip.
+
+    Returns the film as well, NaN where something was taken out.
+    """
+    clean = [t for t in fitted if is_tee(t)]
+    left = np.array([excess_of(t, noise) for t in clean])
+    odd = left > _ODD * np.median(left) if len(left) else np.zeros(0, bool)
+    plain = [t for t, is_odd in zip(clean, odd, strict=True) if not is_odd]
+    disturbed = [t for t in fitted if all(t is not p for p in plain)]
+    if not disturbed or len(plain) < _LEAST_PARALLEL:
+        return film, fitted, optics
+    bare, again = uncovered(film, plain, disturbed, optics, noise)
+    bared, as_before = [t for t in again if t is not None], [t for t, now in zip(disturbed, again, strict=True) if now is None]
+    if not bared:
+        return film, fitted, optics
+    fitted, optics = fit_shared(bare, [*plain, *bared, *as_before], optics, noise, parallel=True)
+    return bare, fitted[: len(plain) + len(bared)] + as_before, optics
 
 
 def _apart(rough: list[NeedleFit], known: list[NeedleFit], gap_px: float) -> list[NeedleFit]:
