@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import rsa_vision.detect
 from rsa_vision.detect import Detection, detect_markers
 from rsa_vision.detect.film.noise import estimate_noise
+from rsa_vision.detect.marks.polarity import Seen, polarities
 from rsa_vision.flags import MarkerFlag
 
 from .films import ATTENUATION, film_of_balls, grid_of_balls, stored
@@ -113,6 +118,23 @@ def test_polarity_does_not_matter(bits: int) -> None:
     assert len(dark.images) == len(bright.images) == 16
     _, gap = nearest(dark.images.position_px, bright)
     assert gap.max() < 0.1  # rounding goes the other way
+
+
+def test_the_other_polarity_is_looked_at_where_the_likelier_one_has_no_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """First looks took what surrounds balls on a sharpened film for more than the balls, and nothing was found."""
+    rng = np.random.default_rng(8)
+    film = stored(
+        film_of_balls((400, 400), np.array([[101.3, 120.4], [290.2, 110.7], [200.4, 300.1]]), np.full(3, 5.0), noise_sd=400, rng=rng)
+    )
+
+    def misled(*args: Any) -> list[Seen]:
+        balls, others = polarities(*args)
+        return [replace(others, rival=True, weight=balls.weight), replace(balls, rival=False, weight=others.weight)]
+
+    monkeypatch.setattr(rsa_vision.detect, "polarities", misled)
+    found = detect_markers(film, bits=16)
+    assert len(found.images) == 3
+    assert found.dark_markers
 
 
 @pytest.mark.parametrize("distance", [2.6, 1.6, 1.0, 0.75, 0.5])

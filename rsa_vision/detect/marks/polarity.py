@@ -31,7 +31,6 @@ _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
 _RIVAL = 0.25  # of the evidence of the better polarity, from which the other is looked at as well
-_PERHAPS = 150.0  # evidence from which it is looked at even so, if the better one has shown none
 _ONE_BALL, _OF_PINS = CAP, 3 * CAP  # evidence of balls, up to which all may be a speck, and of pins, from which they know better
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
 _MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: of marks it has next to none
@@ -181,7 +180,7 @@ def polarities(
     least = _RIVAL * seen[best].weight if seen[best].weight > _LEAST_EVIDENCE else 0.0
     rivals = [replace(seen[sign], rival=sign == best or seen[sign].weight >= least) for sign in signs]
     # what surrounds marks of hardly any noise answers to the search as well: if there is nothing in it, the marks are the others
-    return sorted([s for s in rivals if s.rival or s.weight > _PERHAPS], key=lambda s: s.sign != best)
+    return sorted(rivals, key=lambda s: s.sign != best)
 
 
 def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFit], candidates: Candidates, noise: NoiseModel) -> Seen:
