@@ -87,11 +87,32 @@ def test_errors_that_depth_and_background_share_are_no_proportion(true: float) -
         background = rng.normal(30000.0, 1500.0, 40)
         shared = rng.normal(0.0, 1000.0, 40)
         depth = -15000.0 + true * (background - 30000.0) - shared
-        told.append(proportion(depth, background + shared, background + rng.normal(0.0, 1000.0, 40)))
+        told.append(proportion(depth, background + shared, background + rng.normal(0.0, 1000.0, 40), background))
     slope, sd = np.array([t.slope for t in told]), np.array([t.sd for t in told])
     print(f"proportion {true}: {slope.mean():.3f}, scatter {slope.std():.3f}, stated {sd.mean():.3f}")
     assert abs(slope.mean() - true) < 0.25 * 0.5  # drawn towards none by the prior
     assert 0.7 < np.sqrt((((slope - true) / sd) ** 2).mean()) < 1.3
+
+
+def test_near_the_end_of_the_scale_depths_fall_ever_faster_and_the_slope_is_that_of_the_place() -> None:
+    """One straight line for all took 4 for 13 and 50: balls beside a limb were drawn towards it by up to twenty stated errors."""
+    rng = np.random.default_rng(43)
+    full, light = 4095.0, np.sort(rng.uniform(0.3, 4.0, 30))
+
+    def shown(light: np.ndarray) -> np.ndarray:
+        return full * (1 - np.exp(-light))
+
+    background = shown(light)
+    depth = shown(0.4 * light) - background + rng.normal(0.0, 5.0, 30)
+    told = proportion(depth, background + rng.normal(0.0, 1.0, 30), background, background)
+    true = 0.4 * np.exp(0.6 * light) - 1
+    bent = light > 2.5
+    print(np.column_stack([true, told.slope, told.sd])[bent].round(2))
+    assert told.slope[bent] == pytest.approx(true[bent], rel=0.35)
+    assert (np.abs(told.slope - true) < 2 * told.sd)[bent].all()
+    straight = proportion(-0.4 * background + rng.normal(0.0, 5.0, 30), background, background, background)
+    assert np.ptp(straight.slope) == 0  # one for all, with its own small error
+    assert straight.sd.max() < 0.05
 
 
 def test_a_ball_of_another_size_keeps_its_own() -> None:

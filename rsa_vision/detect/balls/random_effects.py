@@ -37,7 +37,6 @@ class Common:
     noise: NoiseModel
     under: float
     size: Size
-    proportion: Proportion
     differ: float  # of structure from window to window: standard deviation of its logarithm
     spot: Spot | None = None  # that draws them, if it is no Gaussian
     more: float = 0.0  # variance of noise that a screen has spread, which is not stated, in units of that under balls
@@ -60,6 +59,7 @@ class Windows:
     added: Float  # (n, pixels), those
     valid: Bool  # (n, pixels)
     covered: Float  # (n,), part of the ball on which something else lies
+    proportion: Proportion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +116,7 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
         left = windows.data - ball
         if step in _AFRESH or far:
             # a mark takes away its part of what is there: on linear films more where there is more
-            shade = 1 + common.proportion.slope * value[:, None]
+            shade = 1 + windows.proportion.slope[:, None, None] * value[:, None]
             curves = surface * shade
             curves[:, 0] = surface[0]
             moves = [-depth[:, None] * by[0], -depth[:, None] * by[1], depth[:, None] * by[2], value]

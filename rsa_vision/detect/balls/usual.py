@@ -12,6 +12,9 @@ from rsa_vision.types import Float, Int
 
 _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
+_LEAST_BENT, _NEAREST = 10, 6  # those whose depths tell it at their own background, and how many do for each
+_BENT = 0.5  # of what a straight line leaves of depths, that is left by those at nearly the same background
+_UNSEEN = 2.0  # times the slope that they tell: the film shows less of how the light changes beside them as well
 _LEAST_VALUE = 1.0  # of a film
 _OUTLIER = 3.0
 _FEW = 0.25  # clear balls to one that is fitted with an edge, from which they do not tell which sizes are usual
@@ -117,46 +120,80 @@ def size_unlike(balls: BallFits, clear: BallFits) -> Float:
     return np.asarray(more)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Proportion:
-    """Change of a ball's depth with the background, both in film values, and its standard deviation."""
+    """Change of balls' depths with the background, both in film values, and its standard deviation; shape (n,)."""
 
-    slope: float
-    sd: float
+    slope: Float
+    sd: Float
+
+    def rows(self, which: Int) -> Proportion:
+        """Return those that ``which`` selects."""
+        return Proportion(self.slope[which], self.sd[which])
 
 
-def proportion(depth: Float, background: Float, beside: Float) -> Proportion:
-    """Tell how depths go with the background: not at all on logarithmic films, like it on linear ones.
+def proportion(depth: Float, background: Float, beside: Float, at: Float) -> Proportion:
+    """Tell how depths go with the background: not at all on logarithmic films, like it on linear ones, near the end of a curve as it bends.
 
     The fits' own backgrounds have errors that are those of the depths with the other sign. Values farther off have not, and go with the
     backgrounds all the same: they are the instrument of the regression (Wright, 1928), by their ranks. The prior is centred on none and as
-    wide as a linear film's.
+    wide as a linear film's. Where the depths of others at nearly the same background foretell each depth much better than a straight line
+    does, they tell the slope there.
 
     Parameters
     ----------
-    depth, background : ndarray of shape (n,)
+    depth, background : ndarray of shape (m,)
         Of clear balls.
-    beside : ndarray of shape (n,)
+    beside : ndarray of shape (m,)
         Values of the film beside them.
+    at : ndarray of shape (n,)
+        Backgrounds of the balls of which it is asked.
 
     Returns
     -------
     Proportion
     """
+    slope, sd = proportion_of_all(depth, background, beside)
+    if len(depth) < _LEAST_BENT:
+        return Proportion(np.full(len(at), slope), np.full(len(at), sd))
+    gap = np.abs(background[:, None] - background)
+    others = np.argsort(gap + np.diag(np.full(len(gap), np.inf)), axis=1)[:, :_NEAREST]
+    line, near = _lines(depth[None], background[None], background)[0], _lines(depth[others], background[others], background)[0]
+    if np.median(np.abs(near - depth)) > _BENT * np.median(np.abs(line - depth)):
+        return Proportion(np.full(len(at), slope), np.full(len(at), sd))
+    order = np.argsort(np.abs(at[:, None] - background), axis=1)
+    (_, local, error), (_, wider, _) = (
+        _lines(depth[order[:, :count]], background[order[:, :count]], at) for count in (_NEAREST, 2 * _NEAREST)
+    )
+    return Proportion(local, np.sqrt(error**2 + (0.5 * (local - wider)) ** 2 + (_UNSEEN * local) ** 2))
+
+
+def _lines(depth: Float, background: Float, at: Float) -> tuple[Float, Float, Float]:
+    """Return what straight lines through depths (n, k) come to at backgrounds (n,), their slopes, and the errors of these."""
+    off = background - background.mean(axis=1, keepdims=True)
+    square = np.maximum((off**2).sum(axis=1), 1e-12)
+    slope = (off * depth).sum(axis=1) / square
+    left = depth - depth.mean(axis=1, keepdims=True) - slope[:, None] * off
+    error = np.sqrt((left**2).sum(axis=1) / (depth.shape[1] - 2) / square)
+    return depth.mean(axis=1) + slope * (at - background.mean(axis=1)), slope, error
+
+
+def proportion_of_all(depth: Float, background: Float, beside: Float) -> tuple[float, float]:
+    """Return the slope of a straight line through depths by background, and its error; arguments as of :func:`proportion`."""
     if len(depth) == 0:
-        return Proportion(0.0, 0.0)
+        return 0.0, 0.0
     of_linear = abs(float(np.median(depth))) / max(abs(float(np.median(background))), _LEAST_VALUE)
     if len(depth) < _LEAST_BALLS:
-        return Proportion(0.0, of_linear)
+        return 0.0, of_linear
     rank = np.argsort(np.argsort(beside)) - 0.5 * (len(beside) - 1)
     middle = float(np.median(depth))
     far = _OUTLIER * SD_OF_MAD * float(np.median(np.abs(depth - middle)))
     depth = np.clip(depth, middle - far, middle + far)
     shared = float(rank @ background)
     if shared <= 0:
-        return Proportion(0.0, of_linear)
+        return 0.0, of_linear
     slope = float(rank @ depth) / shared
     left = depth - depth.mean() - slope * (background - background.mean())
     error = float(np.sqrt(left @ left / (len(left) - 2) * (rank @ rank))) / shared
     drawn = 1 + (error / of_linear) ** 2
-    return Proportion(slope / drawn, error / np.sqrt(drawn))
+    return slope / drawn, error / float(np.sqrt(drawn))

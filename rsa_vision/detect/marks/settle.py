@@ -26,7 +26,7 @@ from rsa_vision.detect.balls.focal_spot import shapes_of
 from rsa_vision.detect.balls.quanta import ENOUGH, Left, left_over, shared_more, spread
 from rsa_vision.detect.balls.random_effects import Common, Solution, Windows, hold, solve, variance_of
 from rsa_vision.detect.balls.surroundings import Modes, Places, around_each, mean_beside, modes, texture
-from rsa_vision.detect.balls.usual import proportion, size_unlike, usual_size
+from rsa_vision.detect.balls.usual import Proportion, proportion, size_unlike, usual_size
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.shoulder import Curve, curve_of, shown, unseen_slope
@@ -105,14 +105,14 @@ def settle(
         noise,
         under,
         usual_size(clear),
-        proportion(balls.depth[told], balls.background[told], level[told]),
         around.differ,
     )
     clear_drawn = balls.rows(free & drawn & ~edged & (balls.chi2_ring < STRUCTURE))
     by_spot = replace(alike, size=usual_size(clear_drawn), spot=found.spot)
     single = free & ~drawn
     usual = float(np.median(balls.chi2_uneven[single])) if single.any() else 1.0  # what all balls leave is no speck on one
-    fit = partial(_fitted, film, found, places, free, beside, structure, usual)
+    of_depth = proportion(balls.depth[told], balls.background[told], level[told], balls.background)
+    fit = partial(_fitted, film, found, places, free, beside, structure, usual, of_depth)
     last = fit(alike, by_spot)
     if any(specks.found.any() for specks in last.specks):  # or noise, of which there may be more under balls
         alike, by_spot = (replace(common, rough=how_rough(last.specks)) for common in (alike, by_spot))
@@ -148,6 +148,7 @@ def _fitted(
     beside: Beside,
     structure: Float,
     usual: float,
+    of_depth: Proportion,
     alike: Common,
     by_spot: Common,
 ) -> _Fitted:
@@ -159,7 +160,8 @@ def _fitted(
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
         for batch, common in _batches(drawn[these.balls], alike, by_spot):
             part = these.balls[batch]
-            windows = _without_others(_windows(film, balls, part, these.half, beside, noise), edged[part], common)
+            windows = _windows(film, balls, part, these.half, beside, noise, of_depth)
+            windows = _without_others(windows, edged[part], common)
             solution = solve(windows, known, structure[part], common)
             excess = np.maximum(under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
             specks = find_specks(solution, solution.radius_px + common.rim_px, windows.fits.depth, excess, 2 * these.half + 1, common)
@@ -194,7 +196,7 @@ def _fitted(
                 left.append(left_over(solution, clear_ones, *of, known, these.half, common))
             both[~crossed] = 0.0
             stay = free[part] & ~moved
-            out.covariance[part[stay], :2, :2] += (both + hidden)[stay]
+            out.covariance[part[stay], :2, :2] += (both + hidden + _by_depth(windows, solution))[stay]
             mine = np.isin(these.near, batch)
             by_background, near = solution.estimator * solution.shade, np.searchsorted(batch, these.near[mine])
             errors[mine, 0] = _held_over(these.values[mine], near, by_background, known, structure[part], noise)
@@ -211,7 +213,7 @@ def _batches(drawn: Bool, alike: Common, by_spot: Common) -> Iterator[tuple[Int,
             yield index[begin : begin + _BATCH], common
 
 
-def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: Beside, noise: NoiseModel) -> Windows:
+def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: Beside, noise: NoiseModel, of_depth: Proportion) -> Windows:
     fits = balls.rows(part)
     patches = cut(film, fits.position_px, half, noise)
     corner = patches.corner_px.astype(np.float64)
@@ -228,6 +230,7 @@ def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: 
         added.reshape(flat),
         (patches.valid & ~doubtful).reshape(flat),
         np.zeros(len(part)),
+        of_depth.rows(part),
     )
 
 
@@ -270,7 +273,7 @@ def _fits(windows: Windows, found: Solution, specks: Specks, known: Modes, commo
         + _by((estimator * found.shade) @ known.surface, at_ease * variance_of(known, found.structure))
         # what holding the radius at the usual one does where it is not, and what a wrong proportion does
         + _by(found.inverse[:, :2, 2:3] * found.held[:, None, None], every * common.size.radius_sd_px**2)
-        + _by(np.matmul(estimator, found.ground[:, :, None]), every * common.proportion.sd**2)
+        + _by_depth(windows, found)
         + specks.covariance
         + OF_SHIFT * specks.shift_px[:, :, None] * specks.shift_px[:, None]
     )
@@ -292,6 +295,11 @@ def _of_noise(estimator: Float, weight: Float, side: int, common: Common) -> Flo
     if common.more:
         covariance = covariance + common.more * influence_covariance(by_noise, spread(common.noise, common.optics).correlation)
     return np.asarray(common.under * covariance)
+
+
+def _by_depth(windows: Windows, found: Solution) -> Float:
+    """Covariance by an error of how depths go with the background, shape (n, 2, 2)."""
+    return _by(np.matmul(found.estimator, found.ground[:, :, None]), windows.proportion.sd[:, None] ** 2)
 
 
 def _hidden(windows: Windows, found: Solution, curve: Curve, common: Common) -> Float:

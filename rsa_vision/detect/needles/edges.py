@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.usual import proportion
+from rsa_vision.detect.balls.usual import proportion_of_all
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import weighted_least_squares
 from rsa_vision.detect.models.needles import NeedleFit, needle_image
@@ -87,7 +87,7 @@ def beside_edges(
 def proportion_of(film: NDArray[Any], tees: list[NeedleFit], optics: Optics) -> float:
     """Return how the depths of tees go with their backgrounds."""
     depth, background = (np.array([getattr(t, name) for t in tees]) for name in ("depth", "background"))
-    return proportion(depth, background, np.array([_beside(film, t, optics) for t in tees])).slope
+    return proportion_of_all(depth, background, np.array([_beside(film, t, optics) for t in tees]))[0]
 
 
 def _beside(film: NDArray[Any], tee: NeedleFit, optics: Optics) -> float:
