@@ -138,7 +138,7 @@ def proportion(depth: Float, background: Float, beside: Float, at: Float) -> Pro
     The fits' own backgrounds have errors that are those of the depths with the other sign. Values farther off have not, and go with the
     backgrounds all the same: they are the instrument of the regression (Wright, 1928), by their ranks. The prior is centred on none and as
     wide as a linear film's. Where the depths of others at nearly the same background foretell each depth much better than a straight line
-    does, they tell the slope there.
+    or the usual depth does, they tell the slope there.
 
     Parameters
     ----------
@@ -159,7 +159,8 @@ def proportion(depth: Float, background: Float, beside: Float, at: Float) -> Pro
     gap = np.abs(background[:, None] - background)
     others = np.argsort(gap + np.diag(np.full(len(gap), np.inf)), axis=1)[:, :_NEAREST]
     line, near = _lines(depth[None], background[None], background)[0], _lines(depth[others], background[others], background)[0]
-    if np.median(np.abs(near - depth)) > _BENT * np.median(np.abs(line - depth)):
+    left, by_line, at_all = (float(np.median(np.abs(depth - of))) for of in (near, line, np.median(depth)))
+    if left > _BENT * min(by_line, at_all):  # a few of another kind turn a line, and none
         return Proportion(np.full(len(at), slope), np.full(len(at), sd))
     order = np.argsort(np.abs(at[:, None] - background), axis=1)
     (_, local, error), (_, wider, _) = (

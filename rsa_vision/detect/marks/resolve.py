@@ -339,7 +339,10 @@ def _unexplained_pairs(
         if used[i]:
             continue
         gap = np.hypot(*(peaks - peaks[i]).T)
-        company = np.nonzero((gap < 2 * typical + TOUCH * optics.sigma_px) & (gap > 0.6 * typical) & free & ~used)[0]
+        own, touching = 0.6 * typical, 2 * typical + TOUCH * optics.sigma_px
+        company = np.nonzero((gap < touching) & (gap > own) & free & ~used)[0]
+        if len(company) < _COMPANY:
+            company = _chain(peaks, np.append(i, company), free & ~used, own, touching)
         if sized and len(company) > _COMPANY:  # fine peaks lie all along the rim of a large ball
             company = company[candidates.radius_px[fine[company]] > _COARSE * typical]
         company = company[np.argsort(gap[company])][: MOST_IN_GROUP - 1]
@@ -350,6 +353,23 @@ def _unexplained_pairs(
         used[[i, *company]] = True
         out.append(np.column_stack([starts, np.full(len(starts), typical)]))
     return out[:200]
+
+
+def _chain(peaks: Float, first: Int, free: Bool, own_px: float, touch_px: float) -> Int:
+    """Return all but the first of some peaks, with those that touch these, and so on, if they are few and one behind the other.
+
+    Where they touch each other all round there may be anything of that size: a full stop of lead passes for four balls.
+    """
+    chain = first
+    while len(chain) <= _COMPANY + 1:
+        nearest = np.hypot(*(peaks[:, None] - peaks[chain]).transpose(2, 0, 1)).min(axis=1)
+        more = np.flatnonzero(free & (nearest < touch_px) & (nearest > own_px))
+        if not len(more):
+            apart = np.hypot(*(peaks[chain][:, None] - peaks[chain]).transpose(2, 0, 1))
+            in_a_row = np.count_nonzero(np.triu(apart < touch_px, 1)) < len(chain)
+            return chain[1:] if in_a_row else first[1:]
+        chain = np.append(chain, more[nearest[more].argmin()])
+    return first[1:]
 
 
 def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
