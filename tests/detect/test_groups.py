@@ -28,7 +28,7 @@ def test_where_there_are_no_balls_none_goes_far(seed: int) -> None:
 def test_balls_in_a_row_that_touch_are_all_found(n: int, apart: float) -> None:
     """Each was fitted beside the one next to it while the third disturbed both: of sixty such rows thirty-two gave nothing."""
     rng = np.random.default_rng(12)
-    single, radius = grid_of_balls(rng, 4, 110.0, (4.4, 4.4))
+    single, _ = grid_of_balls(rng, 4, 110.0, (4.4, 4.4))
     film_side, rows = 700, []
     for k in range(4):
         way = rng.uniform(0, np.pi)
