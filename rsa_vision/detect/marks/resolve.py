@@ -31,6 +31,7 @@ from rsa_vision.types import Bool, Float, Int
 
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _COMPANY, _COARSE = 3, 0.6  # peaks beside one that a group may start from; of the radius, from which they are a ball's own
+_NECKS, _BAR = 1.7, 0.03  # of the radius, between balls in a row of which one does not touch another; misfit that they may leave
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
 
@@ -137,7 +138,8 @@ def resolve_balls(
         while sized and len(pair.depth) > 2 and not _like(pair, like).all() and np.count_nonzero(plausible(pair, noise)) > 1:
             pair = pair.rows(np.arange(len(pair.depth)) != pair.significance.argmin())
             pair = fit_group(film, pair.position_px, np.full(len(pair.depth), members[0, 2]), optics.sigma_px, optics.mu_px, noise, tees)
-        fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
+        if not _is_bar(pair, like, 2 * members[0, 2] + TOUCH * optics.sigma_px, noise):
+            fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     asked = clean & promising(single, limit, optics.sigma_px, noise) & ~hopeless(single, optics.sigma_px, noise)
     one_each = single.rows(asked)
@@ -342,7 +344,7 @@ def _unexplained_pairs(
         own, touching = 0.6 * typical, 2 * typical + TOUCH * optics.sigma_px
         company = np.nonzero((gap < touching) & (gap > own) & free & ~used)[0]
         if len(company) < _COMPANY:
-            company = _chain(peaks, np.append(i, company), free & ~used, own, touching)
+            company = _chain(peaks, np.append(i, company), free & ~used, own, _NECKS * typical, touching)
         if sized and len(company) > _COMPANY:  # fine peaks lie all along the rim of a large ball
             company = company[candidates.radius_px[fine[company]] > _COARSE * typical]
         company = company[np.argsort(gap[company])][: MOST_IN_GROUP - 1]
@@ -355,10 +357,11 @@ def _unexplained_pairs(
     return out[:200]
 
 
-def _chain(peaks: Float, first: Int, free: Bool, own_px: float, touch_px: float) -> Int:
+def _chain(peaks: Float, first: Int, free: Bool, own_px: float, neck_px: float, touch_px: float) -> Int:
     """Return all but the first of some peaks, with those that touch these, and so on, if they are few and one behind the other.
 
-    Where they touch each other all round there may be anything of that size: a full stop of lead passes for four balls.
+    Where they touch each other all round there may be anything of that size: a full stop of lead passes for four balls. Nearer to each
+    other they show no necks, as a wire shows none.
     """
     chain = first
     while len(chain) <= _COMPANY + 1:
@@ -366,10 +369,23 @@ def _chain(peaks: Float, first: Int, free: Bool, own_px: float, touch_px: float)
         more = np.flatnonzero(free & (nearest < touch_px) & (nearest > own_px))
         if not len(more):
             apart = np.hypot(*(peaks[chain][:, None] - peaks[chain]).transpose(2, 0, 1))
-            in_a_row = np.count_nonzero(np.triu(apart < touch_px, 1)) < len(chain)
-            return chain[1:] if in_a_row else first[1:]
+            links = apart[np.triu(apart < touch_px, 1)]
+            return chain[1:] if len(links) < len(chain) and links.min(initial=np.inf) > neck_px else first[1:]
         chain = np.append(chain, more[nearest[more].argmin()])
     return first[1:]
+
+
+def _is_bar(fits: BallFits, like: BallFits, touch_px: float, noise: NoiseModel) -> bool:
+    """Say whether balls in a row, of which one does not touch another, lap too far to show necks, or leave what single ones do not.
+
+    A bar is explained nearly as well by some.
+    """
+    apart = np.hypot(*(fits.position_px[:, None] - fits.position_px).transpose(2, 0, 1)) + 1e9 * np.eye(len(fits.depth))
+    if len(apart) < LEAST_KNOWN or not (np.triu(apart, 1) > touch_px).any():
+        return False
+    left = misfit(fits, noise)
+    unlike = (left > max(_UNLIKE * float(np.median(misfit(like, noise))), _BAR)) & (fits.chi2_core > 1 + 5 * noise.scatter(fits.n_core))
+    return bool(unlike.any() or (apart.min(axis=1) < _NECKS * fits.radius_px).any())
 
 
 def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
