@@ -95,7 +95,7 @@ def test_errors_that_depth_and_background_share_are_no_proportion(true: float) -
 
 
 def test_near_the_end_of_the_scale_depths_fall_ever_faster_and_the_slope_is_that_of_the_place() -> None:
-    """One straight line for all took 0.2 for 13 and 50 on such a film: balls beside a limb were drawn towards it by up to twenty stated errors."""
+    """One line for all took 0.2 for 13 and 50 on such a film: balls beside a limb were drawn towards it by up to twenty stated errors."""
     rng = np.random.default_rng(43)
     full, light = 4095.0, np.sort(rng.uniform(0.3, 4.0, 30))
 
