@@ -91,7 +91,7 @@ def _judge_films(points: ImagePoints) -> list[Finding]:
 
 
 def _is_one_picture(one: ImagePoints, other: ImagePoints) -> bool:
-    """Say whether images of markers and marks lie alike on two films, but for a turn and a shift: foci apart show depths differently."""
+    """Say whether images of markers and marks lie alike on two films, but for turn, shift and scale: foci apart show depths differently."""
     objects = [{str(p.number[i]): complex(*p.position_px[i]) for i in np.flatnonzero(p.role == "object")} for p in (one, other)]
     both = sorted(objects[0].keys() & objects[1].keys())
     if len(both) < LEAST_ALIKE:

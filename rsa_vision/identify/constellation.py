@@ -89,7 +89,7 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -
     return _with_loose(segments, points, known)
 
 
-def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) -> list[tuple[float, Pairs]]:
+def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) -> list[tuple[float, Pairs, Placement]]:
     """List the assignments of a segment to points.
 
     Parameters
@@ -102,15 +102,16 @@ def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) ->
 
     Returns
     -------
-    list of (log odds, pairs)
+    list of (log odds, pairs, Placement)
         Against all these points being strays, the likeliest first.
     """
-    found = candidate_poses(segment, points, float(np.log(volume / stray)))
-    return _sorted([(log_odds(len(segment), placement, pairs, volume, stray), pairs) for pairs, placement in found])[:MOST_RIVALS]
+    found = dict(candidate_poses(segment, points, float(np.log(volume / stray))))
+    rivals = _sorted([(log_odds(len(segment), placement, pairs, volume, stray), pairs) for pairs, placement in found.items()])
+    return [(odds, pairs, found[pairs]) for odds, pairs in rivals[:MOST_RIVALS]]
 
 
 def _with_one_loose(
-    segment: Cloud, points: Cloud, groups: Sequence[tuple[float, Pairs]], volume_of_a_stray: float
+    segment: Cloud, points: Cloud, groups: Sequence[tuple[float, Pairs, Placement]], volume_of_a_stray: float
 ) -> list[tuple[float, Pairs, Pairs]]:
     """Add to assignments those with one marker more, that has moved in its bone: its point lies anywhere near its place.
 
@@ -118,10 +119,8 @@ def _with_one_loose(
     happens to lie where the marker that moved is missing.
     """
     gain = np.log(LOOSE * FOUND / (1 - FOUND) * volume_of_a_stray / (4 / 3 * np.pi * LOOSE_MM**3))
-    rivals: list[tuple[float, Pairs, Pairs]] = [(odds, pairs, ()) for odds, pairs in groups]
-    for odds, pairs in groups:
-        if (placement := place(segment, points, pairs)) is None:
-            continue
+    rivals: list[tuple[float, Pairs, Pairs]] = [(odds, pairs, ()) for odds, pairs, _ in groups]
+    for odds, pairs, placement in groups:
         lost, free = _others(len(segment), dict(pairs).keys()), _others(len(points), dict(pairs).values())
         away = np.linalg.norm(points.position_mm[free] - placement.predict(segment.position_mm[lost])[0][:, None], axis=-1)
         rivals += [(odds + float(gain), pairs, ((int(lost[i]), int(free[a])),)) for i, a in np.argwhere(away < LOOSE_MM).tolist()]

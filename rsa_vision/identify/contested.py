@@ -76,7 +76,7 @@ def _joined(one: Cloud, other: Cloud) -> Cloud:
 
 def _possible(segment: Cloud, points: Cloud, volume: float, stray: float, images: Sequence[tuple[int, ...]]) -> list[tuple[float, Pairs]]:
     """List the assignments of a segment that use no image twice; of others what is left without one or the other point."""
-    listed = {pairs: odds for odds, pairs in likely_groups(segment, points, volume, stray)}
+    listed = {pairs: odds for odds, pairs, _ in likely_groups(segment, points, volume, stray)}
     found: dict[Pairs, float] = {}
     left = list(listed)
     while left:

@@ -245,7 +245,7 @@ def test_films_of_another_subject_are_reviewed_and_no_others() -> None:
 def test_a_marker_that_only_some_of_its_group_would_name_is_loose() -> None:
     """Three of eight agreed with a moved marker of large errors; nothing was said of the others."""
     loose = 0
-    for seed in range(30, 45):
+    for seed in range(30, 45):  # one of them; the others are reviewed
         rng = np.random.default_rng(seed)
         body = rng.uniform(-25, 25, (8, 3))
         turn = Rotation.from_euler("xyz", rng.normal(0, 4, 3), degrees=True)
@@ -261,7 +261,7 @@ def test_a_marker_that_only_some_of_its_group_would_name_is_loose() -> None:
             loose += 1
         else:
             assert second["exams"][0]["status"] == "review"
-    assert loose > 0
+    assert loose == 1
 
 
 def test_doubtful_pairs_that_agree_with_the_segment_stay_in_review_and_it_says_so() -> None:
