@@ -83,6 +83,28 @@ def test_a_quarter_of_a_diameter_apart_among_balls_of_other_sizes_where_hardly_a
     assert np.count_nonzero(flagged[~double]) <= 1
 
 
+def test_where_many_images_are_two_balls_nearly_in_one_beam() -> None:
+    """Then it is their outline that is usual, and their size."""
+    unflagged = doubles = flagged = singles = 0
+    for seed in range(FILMS):
+        rng = np.random.default_rng(200 + seed)
+        truth, radius = grid_of_balls(rng, 6, CELL, (3.0, 3.2))
+        double = np.arange(len(truth)) % 3 == 0
+        angle, apart = rng.uniform(0, 2 * np.pi, len(truth)), rng.uniform(0.18, 0.25, len(truth)) * 2 * radius
+        second = (truth + apart[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))[double]
+        light, other = (
+            film_of_balls((400, 400), at, of, background=1.0, depth=0.6, sigma_px=1.2)
+            for at, of in ((truth, radius), (second, radius[double]))
+        )
+        found = detect_markers(stored(30000 * (light * other + 0.6 / 50 * rng.standard_normal((400, 400)))), bits=16).images
+        sure = (found.flags == 0)[np.hypot(*(truth[:, None] - found.position_px).transpose(2, 0, 1)).argmin(axis=1)]
+        unflagged, doubles = unflagged + int((sure & double).sum()), doubles + int(double.sum())
+        flagged, singles = flagged + int((~sure & ~double).sum()), singles + int((~double).sum())
+    print(f"{unflagged} of {doubles} without a flag, {flagged} of {singles} single balls flagged")
+    assert unflagged <= 0.1 * doubles
+    assert flagged <= 0.02 * singles
+
+
 def test_what_is_larger_is_compared_with_its_own_kind() -> None:
     radius = np.array([3.0, 6.1, 3.1, 5.9, 3.05, 6.0, 3.4, 9.0])
     kinds = kinds_by_size(radius, 2)

@@ -28,6 +28,8 @@ _SURE = 14.0  # chi2 with two degrees of freedom: one image in a thousand, if no
 _BEYOND_DOUBT, _OF_USUAL = 50.0, 3.0  # the same of smaller ones; times the usual outline of the film
 _AMONG_OTHERS = 3.2  # the same where most images are oblong: one in five
 _MEDIAN = 1.386  # of that
+# what an image leaves over what those leave that fit best; chi2 beyond the usual outline of those, for the latter
+_MUCH_LEFT, _MORE_LEFT, _SURE_OF_MORE = 3.0, 1.6, 28.0
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
 _STEP_PX = 0.1  # for derivatives
@@ -68,6 +70,12 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
         told |= _larger(balls.radius_px) & (chance > _SURE_OF_LARGER * usual) & (length > _LEAST_OF_LARGER)
         odd = (chance > _BEYOND_DOUBT * usual) & (length > _OF_USUAL * np.median(length))  # where hardly any noise hides an outline
         told |= odd & (length > _LEAST_OF_LARGER)
+        # where many are two balls no outline is usual, but those that fit best are single ones, or resolved
+        best = np.argsort(balls.chi2_core)[: max(_LEAST_KNOWN // 2, len(told) // 4)]
+        over = balls.chi2_core / (np.maximum(balls.chi2_ring, 1.0) * np.median(balls.chi2_core[best]))
+        beyond = chance / max(1.0, float(np.median(chance[best])) / _MEDIAN)
+        both = ((over > _MUCH_LEFT) & (chance > _SURE)) | ((over > _MORE_LEFT) & (beyond > _SURE_OF_MORE))
+        told |= both & (length > _LEAST_OF_LARGER)
     if most or len(told) < _LEAST_KNOWN:
         told |= much
     if most:
