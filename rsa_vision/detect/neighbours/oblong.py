@@ -72,10 +72,10 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
         told |= odd & (length > _LEAST_OF_LARGER)
         # where many are two balls no outline is usual, but those that fit best are single ones, or resolved
         best = np.argsort(balls.chi2_core)[: max(_LEAST_KNOWN // 2, len(told) // 4)]
-        over = balls.chi2_core / (np.maximum(balls.chi2_ring, 1.0) * np.median(balls.chi2_core[best]))
+        usually = np.maximum(balls.chi2_ring, 1.0) * np.median(balls.chi2_core[best])
         beyond = chance / max(1.0, float(np.median(chance[best])) / _MEDIAN)
-        both = ((over > _MUCH_LEFT) & (chance > _SURE)) | ((over > _MORE_LEFT) & (beyond > _SURE_OF_MORE))
-        told |= both & (length > _LEAST_OF_LARGER)
+        much_left, more_left = (balls.chi2_core > times * usually for times in (_MUCH_LEFT, _MORE_LEFT))
+        told |= ((much_left & (chance > _SURE)) | (more_left & (beyond > _SURE_OF_MORE))) & (length > _LEAST_OF_LARGER)
     if most or len(told) < _LEAST_KNOWN:
         told |= much
     if most:
