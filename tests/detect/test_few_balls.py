@@ -162,6 +162,25 @@ def test_cut_off_balls_are_evidence_for_their_polarity(radius_px: float, noise: 
     measured(32000 * np.maximum(film - part, 0.0) / (1 - part), truth, bright=False, flag=MarkerFlag.CLIPPED)
 
 
+def test_balls_in_a_burnt_field_are_found_by_what_is_seen_of_them() -> None:
+    """Beside a limb film may be exposed beyond all values: of a ball there only its cap is seen, less than half of it."""
+    rng = np.random.default_rng(0)
+    truth, radius = grid_of_balls(rng, 6, 60.0, (6.0, 6.2))
+    light = film_of_balls((400, 400), truth, radius, background=1.0, depth=0.9, sigma_px=1.1)
+    exposure = light * np.where(np.arange(400) > 190, 2.5, 0.45) * 60000
+    found = detect_markers(stored(exposure + np.sqrt(2 * exposure) * rng.standard_normal(exposure.shape)), bits=16)
+    index, gap = nearest(truth, found)
+    assert len(found.images) == len(truth)
+    assert gap.max() < 0.5
+    burnt = truth[:, 0] > 190
+    assert (found.images.flags[index[burnt]] & MarkerFlag.SATURATED).all()
+    assert not found.images.flags[index[~burnt]].any()
+    error = found.images.position_px[index] - truth
+    ratio = np.sqrt((error**2 / np.einsum("nii->ni", found.images.covariance_px2[index]))[burnt].mean())
+    print(f"error / sd {ratio:.2f}")
+    assert 0.6 < ratio < 1.35  # 36 coordinates
+
+
 @pytest.mark.parametrize("noise_blur_px", [0.0, 0.6])
 @pytest.mark.parametrize("radius_px", [8.0])
 def test_large_balls_with_much_more_noise_than_beside_them_are_found(radius_px: float, noise_blur_px: float) -> None:

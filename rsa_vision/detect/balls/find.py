@@ -31,6 +31,7 @@ CHANCE = 4.0  # standard deviations of the mean square of noise, for which no ma
 EXPLAINED = 0.9
 PROMISING = 0.85  # of the significance a mark must have: better fits are 3 % more significant mostly, 10 % at the most
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
+_CAP, _CAP_MISFIT, _CAP_SURE = 0.4, 0.03, 20.0  # of a ball seen, that is enough if it leaves so little and stands out so far
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
 
@@ -111,14 +112,17 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     -------
     ndarray of bool, shape (n,)
     """
-    # little is left of the window beside a saturated area: enough if the ball itself is whole; of a ball that is cut off, its rim
-    seen = ((fits.valid_fraction > 0.1) & (fits.window_fraction > 0.5)) | ((fits.valid_fraction > 0.6) & (fits.window_fraction > 0.05))
+    left = misfit(fits, noise, CHANCE)
+    # little is left of the window beside a saturated area: enough if the ball itself is whole, or what is seen of it a ball's to the last
+    # per cent; of a ball that is cut off, its rim
+    whole = fits.valid_fraction > np.where((left < _CAP_MISFIT * slack) & (fits.significance > _CAP_SURE), _CAP, 0.6)
+    seen = ((fits.valid_fraction > 0.1) & (fits.window_fraction > 0.5)) | (whole & (fits.window_fraction > 0.05))
     usable = seen & np.isfinite(fits.position_px).all(1)
     # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
     least = 1 - (1 - EXPLAINED) * slack
     stands_out = fits.significance / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
     explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
-    return usable & (misfit(fits, noise, CHANCE) < MISFIT * slack) & explained & (fits.significance > 5.0)
+    return usable & (left < MISFIT * slack) & explained & (fits.significance > 5.0)
 
 
 def in_correlated_noise(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Float:
