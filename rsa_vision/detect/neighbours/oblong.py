@@ -30,6 +30,7 @@ _AMONG_OTHERS = 3.2  # the same where most images are oblong: one in five
 _MEDIAN = 1.386  # of that
 # what an image leaves over what those leave that fit best; chi2 beyond the usual outline of those, for the latter
 _MUCH_LEFT, _MORE_LEFT, _SURE_OF_MORE = 3.0, 1.6, 28.0
+_QUIET = 0.5  # chi2 beside balls: filters that leave less noise there than under them make outlines as well
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
 _STEP_PX = 0.1  # for derivatives
@@ -75,7 +76,8 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
         usually = np.maximum(balls.chi2_ring, 1.0) * np.median(balls.chi2_core[best])
         beyond = chance / max(1.0, float(np.median(chance[best])) / _MEDIAN)
         much_left, more_left = (balls.chi2_core > times * usually for times in (_MUCH_LEFT, _MORE_LEFT))
-        told |= ((much_left & (chance > _SURE)) | (more_left & (beyond > _SURE_OF_MORE))) & (length > _LEAST_OF_LARGER)
+        left = (much_left & (chance > _SURE)) | (more_left & (beyond > _SURE_OF_MORE))
+        told |= left & (length > _LEAST_OF_LARGER) & (np.median(balls.chi2_ring) > _QUIET)
     if most or len(told) < _LEAST_KNOWN:
         told |= much
     if most:
