@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.crowd import lost_in_a_crowd, out_of_a_crowd
 from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, are_balls, faint_beside, look_clear, show_what_marks_are_like
-from rsa_vision.detect.balls.find import MISFIT, ROUNDNESS, STRENGTH, fit_at, plausible
+from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, STRENGTH, fit_at, misfit, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
+from rsa_vision.detect.balls.unlike import of_odd_size
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.marks.noise_curve import noise_by_value
@@ -21,23 +22,25 @@ from rsa_vision.detect.marks.polarity import Seen, off_pins
 from rsa_vision.detect.marks.resolve import Balls, resolve_balls
 from rsa_vision.detect.marks.second_look import look_again
 from rsa_vision.detect.marks.settle import STRUCTURE, settle
-from rsa_vision.detect.marks.table import WHOLE, table_of, what_is_left
-from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.marks.table import NEEDLES_ALIKE, WHOLE, table_of, what_is_left
+from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.first_pins import look_for_pins
+from rsa_vision.detect.needles.fits import significant_misfit
 from rsa_vision.detect.needles.pins import find_pins
-from rsa_vision.detect.needles.sets import is_located, on_arms
+from rsa_vision.detect.needles.sets import as_usual, is_located, on_arms
 from rsa_vision.detect.needles.tees import find_tees, is_tee
-from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, groups_of, images_beside, lapping_balls
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, groups_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.holes import are_holes
+from rsa_vision.detect.neighbours.laid_on import fit_over, look_on_arms, over_arms
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.neighbours.rims import goes_on
 from rsa_vision.detect.neighbours.under_curve import under_curve
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float, Int, MarkerImages
 
-_OVER, _PULL = 0.1, 0.1  # of the depth of a ball, from which a needle lies over it; of its radius, by which that moves its centre
+_PULL = 0.1  # of the radius of a ball, by which a needle over it moves its centre
 _AT_NEEDLES = 1.5  # of their lengths, from the tip: what the search answers to there is of a needle
 # nothing that blurs the noise of a film leaves its marks sharper than that: filters that smooth between edges do, and leave noise at these
 _SMOOTHED, _MUCH_MORE = 1.15, 2.0  # blur of the noise over that of the marks, noise under these over that beside them, from which one did
@@ -176,12 +179,49 @@ def _find_balls(
     found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], crossed=crossed[like])
     if len(found.fits.depth) and not show_what_marks_are_like(found.fits, limit, optics.sigma_px, noise):
         found = found.rows(look_clear(found.fits, noise) | out_of_a_crowd(found.fits, _off_needles(faint, others)))
-    tees = needles.tees
-    for fit in needles.doubtful:
-        if both := part(film, fit, found.fits, optics, needles.tee_optics, noise, needles.painted or _nothing, is_tee):
-            tee, ball = both
-            found = found.rows(np.hypot(*(found.fits.position_px - ball.position_px[0]).T) > ball.radius_px[0])
-            found, tees = found.and_more(ball, touching=True, edged=False, crossed=False), [*tees, tee]
+    if needles.painted is not None:
+        found = _on_needles(film, faint, found, needles.painted, seen, limit)
+    return _taken_apart(film, found, needles, optics, noise)
+
+
+def _on_needles(film: NDArray[Any], faint: Candidates, found: Balls, painted: Painted, seen: Seen, limit: float) -> Balls:
+    """Balls, those on needles fitted with what they take away of these, and more of them."""
+    balls, optics, noise = found.fits, seen.optics, seen.noise
+    over = over_arms(balls, painted)
+    before = balls.rows(over)
+    after = fit_over(film, before.position_px, before.radius_px, balls, optics, noise, painted)
+    stays = np.hypot(*(after.position_px - before.position_px).T) < before.radius_px
+    better = plausible(after, noise) & (misfit(after, noise) <= misfit(before, noise)) & stays
+    before.covariance[:, :2, :2] += (_PULL * before.radius_px[:, None, None]) ** 2 * np.eye(2)
+    more = look_on_arms(film, _likeliest_first(faint), balls, limit, optics, noise, painted)
+    out = found.rows(~over).and_more(after.rows(better), touching=True, edged=False, crossed=False)
+    out = out.and_more(before.rows(~better), touching=True, edged=found.edged[over][~better], crossed=found.crossed[over][~better])
+    return out.and_more(more, touching=True, edged=False, crossed=False)
+
+
+def _taken_apart(film: NDArray[Any], found: Balls, needles: _Needles, optics: Optics, noise: NoiseModel) -> tuple[Balls, list[NeedleFit]]:
+    """Balls, and the tees with those that only a ball on them explains."""
+    tees, painted, tee_optics = list[NeedleFit](), needles.painted or _nothing, needles.tee_optics
+    poor = of_odd_size(np.array([tee.shape.half_width_px for tee in needles.tees]), np.zeros(len(needles.tees)), NEEDLES_ALIKE)
+    poor |= np.array([significant_misfit(tee, noise) > DOUBTFUL * MISFIT for tee in needles.tees], bool)
+    clean = [tee for tee, odd in zip(needles.tees, poor, strict=True) if not odd]
+
+    def without(tee: NeedleFit) -> Background:
+        return lambda cols, rows: painted(cols, rows) - needle_image(cols - tee.position_px[0], rows - tee.position_px[1], tee, tee_optics)
+
+    tried = [(tee, without(tee)) if odd else (tee, None) for tee, odd in zip(needles.tees, poor, strict=True)]
+    for tee, beside in [*tried, *((tee, painted) for tee in needles.doubtful)]:
+        places, both = found.fits.position_px, None
+        on = places[found.touching & on_arms(places, [tee])]
+        if beside and len(on) < 2:
+            start = on[0] if len(on) else None
+            both = part(film, as_usual(tee, clean), found.fits, optics, tee_optics, noise, beside, is_tee, start)
+        if both:
+            tees.append(both[0])
+            found = found.rows(np.hypot(*(places - both[1].position_px[0]).T) > both[1].radius_px[0])
+            found = found.and_more(both[1], touching=True, edged=False, crossed=False)
+        elif tee in needles.tees:
+            tees.append(tee)
     return found, tees
 
 
@@ -229,8 +269,7 @@ def _measured(
     found = replace(found, fits=bent, edged=found.edged & ~under_one_curve)
     balls, ratio, by_size, covered = settle(film, found, around.places, under, free, beside, optics, noise)
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
-        over = painted.under(balls.position_px, balls.radius_px) > _OVER * np.abs(balls.depth)
-        touching, by_size = touching | over, by_size + over * (_PULL * balls.radius_px) ** 2
+        touching = touching | over_arms(balls, painted)
     left, poor = what_is_left(balls, under, optics.sigma_px, noise)
     poor |= covered
     keep = left < _BENT * MISFIT

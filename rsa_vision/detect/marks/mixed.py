@@ -15,13 +15,17 @@ from rsa_vision.detect.balls.find import plausible
 from rsa_vision.detect.balls.fits import BallFits, ball_image
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
-from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image
+from rsa_vision.detect.models.needles import NeedleFit, arm_images
+from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import fit_crossing
-from rsa_vision.detect.neighbours.groups import fit_group
+from rsa_vision.detect.neighbours.beside import Background
+from rsa_vision.detect.neighbours.laid_on import fit_one_over
 from rsa_vision.types import Float
 
 _ROUNDS = 5
+_ROUGHLY = 2.5  # ratio to the usual radius and depth, beyond which no more rounds are worth it after these
+_SOUGHT = 1  # rounds after which the ball is sought anew
 _STEP_PX = 0.01  # for differences of the ball's image
 
 
@@ -32,8 +36,9 @@ def part(
     optics: Optics,
     tee_optics: Optics,
     noise: NoiseModel,
-    beside: Callable[[Float, Float], Float],
+    beside: Background,
     is_tee: Callable[[NeedleFit], bool],
+    start_px: Float | None = None,
 ) -> tuple[NeedleFit, BallFits] | None:
     """Take a tee and a ball on it apart.
 
@@ -49,6 +54,8 @@ def part(
     beside : callable
         Images of all other marks at pixels (cols, rows).
     is_tee : callable
+    start_px : ndarray of shape (2,), optional
+        Where the ball is; else it is looked for.
 
     Returns
     -------
@@ -60,20 +67,28 @@ def part(
     radius, depth = float(np.median(balls.radius_px)), float(np.median(balls.depth))
 
     def without_tee(cols: Float, rows: Float) -> Float:
-        dx, dy = cols - tee.position_px[0], rows - tee.position_px[1]
-        return beside(cols, rows) + needle_image(dx, dy, tee, tee_optics)
-
-    def without_ball(cols: Float, rows: Float) -> Float:
-        dx, dy = (cols - ball.position_px[0, 0]).reshape(1, -1), (rows - ball.position_px[0, 1]).reshape(1, -1)
-        image = ball.depth[0] * ball_image(dx, dy, ball.radius_px, optics.sigma_px, optics.mu_px).reshape(cols.shape)
-        total: Float = beside(cols, rows) + image
+        total: Float = beside(cols, rows) + arms(cols, rows)
         return total
 
-    place = _brightest_rest(film, tee, np.sign(depth), without_tee)
-    ball = fit_group(film, place[None], np.array([radius]), optics.sigma_px, optics.mu_px, noise, without_tee)
-    for _ in range(_ROUNDS):
+    def without_ball(cols: Float, rows: Float) -> Float:
+        total: Float = beside(cols, rows) + shown(cols, rows)
+        return total
+
+    def fitted(at_px: Float, size: float) -> tuple[BallFits, Background]:
+        return fit_one_over(film, at_px, size, without_tee, optics, noise, arms)
+
+    def sought() -> tuple[BallFits, Background]:
+        return fitted(_brightest_rest(film, tee, np.sign(depth), without_tee) if start_px is None else start_px, radius)
+
+    arms = paint([(tee, tee_optics)])
+    ball, shown = sought()
+    for step in range(_ROUNDS):
         tee = fit_crossing(film, [tee], tee_optics, noise, others=without_ball, steps=6)[0]
-        ball = fit_group(film, ball.position_px, ball.radius_px, optics.sigma_px, optics.mu_px, noise, without_tee)
+        arms = paint([(tee, tee_optics)])
+        # what a ball has bent is no good guide to it
+        ball, shown = sought() if step < _SOUGHT else fitted(ball.position_px[0], float(ball.radius_px[0]))
+        if step == _SOUGHT and not (abs(np.log(ball.radius_px[0] / radius)) < np.log(_ROUGHLY) and ball.depth[0] / depth > 1 / _ROUGHLY):
+            return None
     alike = abs(np.log(ball.radius_px[0] / radius)) < 0.25 and 0.4 < ball.depth[0] / depth < 2.5
     if not (alike and plausible(ball, noise).all() and is_tee(tee)):
         return None

@@ -26,7 +26,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 
 EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
-_NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
+NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
@@ -120,7 +120,7 @@ def table_of(
     flags[:n][touching] |= MarkerFlag.OVERLAP
     arms = np.array([len(t.angles) for t in tees])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
-        flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), _NEEDLES_ALIKE)
+        flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), NEEDLES_ALIKE)
     flags[n:][perhaps_arms(tees, junctions) | meet_others(film, tees)] |= MarkerFlag.UNLIKE
     if np.count_nonzero(arms == 1) < LEAST_OF_A_KIND and n >= COMPANY:  # among balls a pin or two are more likely ends of rods
         flags[np.flatnonzero(arms == 1) + n] |= MarkerFlag.UNLIKE

@@ -1,4 +1,4 @@
-"""What two balls in one beam share: the second takes from what the first has left, so their images do not add up."""
+"""What a ball shares with another, or with anything else in one beam: it takes from what that has left, so their images do not add up."""
 
 from __future__ import annotations
 
@@ -101,3 +101,39 @@ def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, si
     # moving both moves the image; moving the second alone changes what they share
     slopes[(slice(None), slice(None), *box)] = [[-by_col - by_two_x, -by_row - by_two_y, by_one_r], [by_two_x, by_two_y, by_two_r]]
     return value.ravel(), slopes.reshape(2, 3, -1)
+
+
+def fine_places(size: int) -> Float:
+    """Return where a window of so many pixels is sampled along either axis for :func:`product_with`: two pixels beyond it as well."""
+    return (np.arange((size + 4) * FINE) + 0.5) / FINE - 2.5
+
+
+def product_with(other: Float, local: Float, radius: float, sigma_px: float, mu_px: float) -> tuple[Float, Float]:
+    """Return the blurred product of the opacity of a ball and of anything else.
+
+    Parameters
+    ----------
+    other : ndarray of shape (m, m)
+        Opacity of that without blur, at the :func:`fine_places` of a square window (rows, columns).
+    local : ndarray of shape (2,)
+        (col, row) of the ball in the window.
+    radius : float
+        Pixels.
+    sigma_px, mu_px : float
+
+    Returns
+    -------
+    value : ndarray of shape (size * size,)
+        As of :func:`product_image`.
+    slopes : ndarray of shape (3, size * size)
+        Its derivatives by the (col, row, radius) of the ball.
+    """
+    size = len(other) // FINE - 4
+    at = fine_places(size)
+    cols, rows = (np.flatnonzero(np.abs(at - middle) < radius + _ROOM_PX) for middle in local)
+    ball = np.append(np.zeros(2), radius)
+    one, *moved = _opacities(at[cols] - local[0], at[rows] - local[1], ball + np.concatenate([np.zeros((1, 3)), _EITHER_WAY]), mu_px)
+    sharp = np.array([one, *((more - less) / (2 * _STEP_PX) for more, less in zip(moved[:3], moved[3:], strict=True))])
+    blur = _blur_to_pixels(len(at), sigma_px)[0]
+    value, *slopes = (blur[:, rows] @ (sharp * other[np.ix_(rows, cols)]) @ blur[:, cols].T).reshape(4, -1)
+    return value, np.array(slopes)

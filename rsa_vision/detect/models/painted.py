@@ -14,6 +14,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
 
 _BLURS = 4.0  # beyond which an image has faded
+_SHARP_PX = 0.2  # blur that tables of needles can draw and films hide
 _EXPLAINED = 0.8  # of the contrast of a place, made by needles: the rest is less than the half of an arm that a ball must be
 _SAMPLES = 12
 _RINGS = (0.0, 0.5, 1.0)  # of a radius, on which samples lie
@@ -29,10 +30,15 @@ class Painted:
         (col, row) of the first pixel of the square around each needle. A picture of the size of the film would be mostly empty, and
         costs more time than all the rest.
     images : ndarray of float32, shape (n, s, s)
+    needles : list of NeedleFit
+    optics : list of Optics
+        Of each of them.
     """
 
     corner_px: Int
     images: NDArray[np.float32]
+    needles: list[NeedleFit]
+    optics: list[Optics]
 
     def __call__(self, cols: Float, rows: Float) -> Float:
         """Return the images at the pixels nearest to these places."""
@@ -47,6 +53,16 @@ class Painted:
             col, row = (at - first for at, first in zip(place, self.corner_px[k], strict=True))
             inside = (col >= 0) & (col < side) & (row >= 0) & (row < side)
             total[inside] += self.images[k, row[inside], col[inside]]
+        return total
+
+    def sharp(self, cols: Float, rows: Float) -> Float:
+        """Return what they would show at these places (c,), (r,) on a film that is linear and hardly blurs, shape (r, c)."""
+        total = np.zeros((len(rows), len(cols)))
+        side = self.images.shape[1]
+        for corner, fit, optics in zip(self.corner_px, self.needles, self.optics, strict=True):
+            if all(first < at[-1] and first + side > at[0] for first, at in zip(corner, (cols, rows), strict=True)):
+                dx, dy = np.meshgrid(cols - fit.position_px[0], rows - fit.position_px[1])
+                total += needle_image(dx, dy, fit, Optics(_SHARP_PX, optics.mu_px))
         return total
 
     def taken_from(self, box: NDArray[Any], left: int, top: int) -> NDArray[np.float32]:
@@ -93,7 +109,7 @@ def paint(needles: list[tuple[NeedleFit, Optics]]) -> Painted:
         dx, dy = (axis + (begin - at) for begin, at in zip(first, fit.position_px, strict=True))
         row, col = np.nonzero(support(dx, dy, fit.angles, fit.shape, _BLURS * optics.sigma_px + 1))
         image[row, col] = needle_image(dx[col], dy[row], fit, optics)
-    return Painted(corner, images)
+    return Painted(corner, images, [fit for fit, _ in needles], [optics for _, optics in needles])
 
 
 def _at(image: NDArray[Any], cols: Float, rows: Float) -> Float:

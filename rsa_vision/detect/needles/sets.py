@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from rsa_vision.types import Bool, Float
 
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
 MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
+LEAST_ALIKE = 3  # needles that tell what one of them is like
 NEAREST_PX = 3.0  # two tips nearer than this are one
 _BESIDE_PX = 10.0  # from the ends of arms, a little longer than they are, within which others are beside them
 
@@ -87,6 +89,21 @@ def _images(near: list[NeedleFit], optics: Optics) -> Images | None:
 def is_located(needle: NeedleFit) -> bool:
     """Say whether the tip is known better than the needle is wide: the rim of something large is as long as one likes and marks nothing."""
     return bool(np.linalg.eigvalsh(needle.covariance_px2)[-1] < (2 * needle.shape.half_width_px) ** 2)
+
+
+def as_usual(tee: NeedleFit, others: list[NeedleFit]) -> NeedleFit:
+    """Return a tee of the usual size of others, its arms meeting at the usual angles: something on one of them turns and stretches it."""
+    if len(others) < LEAST_ALIKE:
+        return tee
+    usual = np.median([_turn(t.angles - t.angles[0]) for t in others], axis=0)
+    first = tee.angles[0] + np.median(_turn(tee.angles - tee.angles[0] - usual))
+    half_width, length = np.median([[t.shape.half_width_px, t.shape.length_px] for t in others], axis=0).tolist()
+    shape = replace(others[0].shape, half_width_px=half_width, length_px=length)
+    return replace(tee, angles=first + usual, shape=shape)
+
+
+def _turn(angles: Float) -> Float:
+    return np.asarray(np.angle(np.exp(1j * angles)))
 
 
 def on_arms(places: Float, needles: list[NeedleFit]) -> Bool:

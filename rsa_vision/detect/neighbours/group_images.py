@@ -17,7 +17,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import columns, cut, weighted_least_squares
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.film_curve import film_curve, slope_of_film_curve
-from rsa_vision.detect.models.lapping import LEAST, lapping, product_image
+from rsa_vision.detect.models.lapping import LEAST, lapping, product_image, product_with
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float
 
@@ -130,6 +130,29 @@ def images_in(
     # a mark takes away its part of what is there: on linear films more beside an implant than behind it, on films of density as much
     linear = columns([value, surface.T, *([] if ground is None else [ground * value]), *products])
     return GroupImages(value, slopes, linear, ground, pairs, of_pairs)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImagesOver(GroupImages):
+    """The same on something else, of which each ball takes away its part."""
+
+    by_taken: Float  # (3, k, n), slopes of what it takes
+
+    def jacobian(self, theta: Float) -> Float:
+        """Return the derivatives by all cols, rows and radii, then by the linear parameters; shape (n, 3 k + p)."""
+        k = len(self.value)
+        by_shape = theta[:k, None] * self.slopes + theta[len(theta) - k :, None] * self.by_taken
+        return columns([by_shape.reshape(3 * k, -1), self.linear.T])
+
+
+def images_over(
+    other: Float, window: GroupWindow, surface: Float, local: Float, radius: Float, sigma_px: float, mu_px: float
+) -> ImagesOver:
+    """Draw balls at places (k, 2) on something else, whose opacity (m, m) is given as of :func:`product_with`."""
+    value, slopes = _alone(window, local, radius, sigma_px, mu_px, None)
+    taken, by_taken = zip(*(product_with(other, at, float(r), sigma_px, mu_px) for at, r in zip(local, radius, strict=True)), strict=True)
+    linear = columns([value, surface.T, np.array(taken)])
+    return ImagesOver(value, slopes, linear, None, [], [], np.stack(by_taken, axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

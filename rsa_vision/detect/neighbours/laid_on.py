@@ -1,0 +1,193 @@
+"""Balls on arms of tees and pins: in one beam a shadow takes only from what the other has left, so the two do not add up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, look_clear, over_clutter
+from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, SURE, distinct, misfit, no_fits, plausible
+from rsa_vision.detect.balls.fits import BallFits, join
+from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.patches import weighted_least_squares
+from rsa_vision.detect.models.lapping import fine_places
+from rsa_vision.detect.models.painted import Painted
+from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.neighbours.beside import Background, all_but
+from rsa_vision.detect.neighbours.edges import OF_SHIFT
+from rsa_vision.detect.neighbours.group_images import GroupImages, GroupWindow, images_in, images_over, window_around
+from rsa_vision.detect.neighbours.groups import fit_group
+from rsa_vision.types import Bool, Float
+
+Draw = Callable[[GroupWindow, Float, Float, Float], GroupImages]
+OVER = 0.1  # of the depth of a ball, from which a needle lies over it
+_OF_SIZE, _DEEP = 1.25, 0.4  # ratio to the radius of clear balls; least depth, in parts of theirs
+_STAYS = 1.0  # of the radius, within which a fit comes out
+_APART = 0.5  # of the radius, between two places from which a fit begins
+
+
+def over_arms(balls: BallFits, painted: Painted) -> Bool:
+    """Say which balls lie on needles, shape (n,)."""
+    return np.asarray(painted.under(balls.position_px, balls.radius_px) > OVER * np.abs(balls.depth))
+
+
+def fit_over(
+    film: NDArray[Any],
+    start_px: Float,
+    start_radius_px: Float,
+    known: BallFits,
+    optics: Optics,
+    noise: NoiseModel,
+    painted: Painted,
+) -> BallFits:
+    """Fit balls on needles, each by itself, with what they take away of these.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    start_px : ndarray of shape (n, 2)
+    start_radius_px : ndarray of shape (n,)
+    known : BallFits
+        Others, whose images are subtracted; those of them at a start are that ball.
+    optics : Optics
+    noise : NoiseModel
+    painted : Painted
+        The needles.
+
+    Returns
+    -------
+    BallFits
+        In the order of the starts.
+    """
+    fits = [no_fits()]
+    for at, radius in zip(start_px, start_radius_px, strict=True):
+        itself = np.flatnonzero(np.hypot(*(known.position_px - at).T) < radius)
+        fits.append(fit_one_over(film, at, float(radius), all_but(known, itself, optics, painted), optics, noise, painted)[0])
+    return join(fits)
+
+
+def fit_one_over(
+    film: NDArray[Any], at_px: Float, radius_px: float, others: Background, optics: Optics, noise: NoiseModel, painted: Painted
+) -> tuple[BallFits, Background]:
+    """Fit one ball on needles; by how far two models of what it takes away of them differ is an error of its centre.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    at_px : ndarray of shape (2,)
+        Start.
+    radius_px : float
+        The same.
+    others : callable
+        Images to be subtracted, those of the needles as well.
+    optics : Optics
+    noise : NoiseModel
+    painted : Painted
+        The needles.
+
+    Returns
+    -------
+    ball : BallFits
+        One row.
+    shown : callable
+        What it adds to the needles at pixels (cols, rows), in film values.
+    """
+    sigma, mu = optics.sigma_px, optics.mu_px
+    tried = [
+        (draw, fit_group(film, at_px[None], np.array([radius_px]), sigma, mu, noise, others, images=draw))
+        for draw in (_linear(painted, optics), _additive(painted, optics))
+    ]
+    (draw, ball), (_, other) = sorted(tried, key=lambda one: float(one[1].chi2_core[0]))
+    apart = ball.position_px - other.position_px
+    ball.covariance[:, :2, :2] += OF_SHIFT * apart[:, :, None] * apart[:, None]
+    window = window_around(film, ball.position_px, ball.radius_px, sigma, noise, others)
+    linear = draw(window, window.surface, ball.position_px - window.corner_px, ball.radius_px).linear
+    theta = weighted_least_squares(linear, window.valid / noise.variance_at(window.raw), window.raw - window.neighbours)
+    picture, corner = (linear[:, [0, -1]] @ theta[[0, -1]]).reshape(window.size, window.size), window.corner_px.astype(np.intp)
+
+    def shown(cols: Float, rows: Float) -> Float:
+        col, row = np.rint(cols).astype(np.intp) - corner[0], np.rint(rows).astype(np.intp) - corner[1]
+        inside = (np.minimum(col, row) >= 0) & (np.maximum(col, row) < window.size)
+        return np.where(inside, picture[row.clip(0, window.size - 1), col.clip(0, window.size - 1)], 0.0)
+
+    return ball, shown
+
+
+def _linear(painted: Painted, optics: Optics) -> Draw:
+    """What draws balls on needles on a film that shows light as it is: the product of both shadows is blurred."""
+
+    @cache
+    def arms(corner_col: float, corner_row: float, size: int) -> Float:
+        fine = fine_places(size)
+        shown = painted.sharp(fine + corner_col, fine + corner_row)
+        return np.asarray(shown / max(float(np.abs(shown).max()), 1e-9))
+
+    def draw(window: GroupWindow, surface: Float, local: Float, radius: Float) -> GroupImages:
+        other = arms(*window.corner_px.tolist(), window.size)
+        return images_over(other, window, surface, local, radius, optics.sigma_px, optics.mu_px)
+
+    return draw
+
+
+def _additive(painted: Painted, optics: Optics) -> Draw:
+    """The same on any other: each takes away a part of what the film shows of the other."""
+
+    def draw(window: GroupWindow, surface: Float, local: Float, radius: Float) -> GroupImages:
+        shown = painted(window.cols + window.corner_px[0], window.rows + window.corner_px[1])
+        arms = shown / max(float(np.abs(shown).max()), 1e-9)
+        return images_in(window, surface, local, radius, optics.sigma_px, optics.mu_px, np.broadcast_to(arms, (len(radius), len(arms))))
+
+    return draw
+
+
+def look_on_arms(
+    film: NDArray[Any], place: Float, known: BallFits, limit: float, optics: Optics, noise: NoiseModel, painted: Painted
+) -> BallFits:
+    """Find balls on needles: like the clear ones of the film, sure, and described well.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    place : ndarray of shape (n, 2)
+        Where to look, likeliest first.
+    known : BallFits
+        Balls of the film; nothing is looked for where one is, and nothing at all where fewer than three are clear.
+    limit : float
+        Significance that noise alone would exceed too often.
+    optics : Optics
+    noise : NoiseModel
+    painted : Painted
+        The needles.
+
+    Returns
+    -------
+    BallFits
+    """
+    clear = known.rows(look_clear(known, noise))
+    if len(clear.depth) < LEAST_KNOWN:
+        return no_fits()
+    usual, depth = float(np.median(clear.radius_px)), float(np.median(np.abs(clear.depth)))
+    sizes = np.full(len(place), usual)
+    place = place[(painted.under(place, sizes) > OVER * depth) & ~painted.explain(film, place, sizes)]
+    place = place[(np.hypot(*(place[:, None] - known.position_px).transpose(2, 0, 1)) > usual).all(axis=1)]
+    starts = _apart(place, _APART * usual)
+    balls = fit_over(film, starts, np.full(len(starts), usual), known, optics, noise, painted)
+    size = np.abs(np.log(balls.radius_px[:, None] / clear.radius_px)).min(axis=1, initial=np.inf) < np.log(_OF_SIZE)
+    close = plausible(balls, noise) & (misfit(balls, noise) < DOUBTFUL * MISFIT)
+    deep = np.sign(np.median(clear.depth)) * balls.depth > _DEEP * depth
+    stays = np.hypot(*(balls.position_px - starts).T) < _STAYS * usual
+    free = (np.hypot(*(balls.position_px[:, None] - known.position_px).transpose(2, 0, 1)) > usual).all(axis=1)
+    return distinct(balls.rows(size & close & deep & stays & free & (over_clutter(balls) > max(SURE, limit))), noise)
+
+
+def _apart(place: Float, gap_px: float) -> Float:
+    """Leave out places nearer to one before them."""
+    kept: list[int] = []
+    for k, at in enumerate(place):
+        if all(np.hypot(*(place[j] - at)) > gap_px for j in kept):
+            kept.append(k)
+    return place[kept]
