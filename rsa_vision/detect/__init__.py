@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.find import STRENGTH, significance_limit
 from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.marks.found import marks_of
-from rsa_vision.detect.marks.polarity import first_looks, is_mottled, polarities
+from rsa_vision.detect.marks.polarity import first_looks, is_mottled, likelier, of_doubtful_polarity, polarities
 from rsa_vision.detect.marks.response import BITS, high_balls, in_film_values, is_straighter, log_odds
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.first_pins import MOST_STROKES, look_for_pins
@@ -71,11 +71,17 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     Detection
     """
     limit = significance_limit(values.size, 2.5, false_detections)
-    return _detect(values, bits, estimate_noise(values, bits), limit)
+    noise = estimate_noise(values, bits)
+    found = _detect(values, bits, noise, limit)
+    if not found:
+        return Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
+    images = [detection.images for _, detection in found]
+    which, contested = likelier(images, [evidence for evidence, _ in found])
+    return replace(found[which][1], images=of_doubtful_polarity(images[which]) if contested else images[which])
 
 
-def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *, as_it_is: bool = False) -> Detection:
-    """``as_it_is``: in no other scale of the values."""
+def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, only: int | None = None) -> list[tuple[float, Detection]]:
+    """Return what is found of either polarity worth a look, with its evidence; ``only``: of that, in no other scale of the values."""
     faint = find_candidates(values, STRENGTH, noise)
     candidates = faint.rows(np.abs(faint.strength) > STRENGTH)
     # strokes at junctions are arms of tees, most likely: they are looked at once it is known that there are none
@@ -85,16 +91,19 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, *,
     seeds, signs = first_looks(values, candidates, pins, noise)
     found: list[tuple[float, Detection]] = []
     for seen in polarities(values, signs, seeds, pins, candidates, noise):
+        if only not in (None, seen.sign):
+            continue
         mottled = is_mottled(seeds, seen.sign, noise)
         # where both show nearly as much, first looks do not say which is which
         if found and found[0][0] > (0.0 if not seen.rival else np.inf if mottled else _BEYOND * seen.weight):
             break
         bright = high_balls(seen.looks, seen.noise)
-        if len(bright.depth) and not as_it_is:
+        if len(bright.depth) and only is None:
             other, its_noise = log_odds(values, bits, noise)
             if is_straighter(values, noise, other, its_noise, bright, seen.optics):
-                detection = _detect(other, BITS, its_noise, limit, as_it_is=True)
-                return replace(detection, images=in_film_values(detection.images, bits))
+                straight = _detect(other, BITS, its_noise, limit, seen.sign)
+                found += [(evidence, replace(each, images=in_film_values(each.images, bits))) for evidence, each in straight]
+                continue
         images, evidence = marks_of(values, bits, seen, pins, candidates, faint, limit, mottled=mottled)
         found.append((evidence, Detection(images, seen.sign < 0, seen.optics, seen.noise)))
-    return max(found, key=lambda item: item[0])[1] if found else Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
+    return found

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtrc
 
-from rsa_vision.detect.balls.decide import CLOSE, faint_beside, height_of
+from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, faint_beside, height_of
 from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, ROUNDNESS, STRENGTH, distinct, first_look
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import BESIDE_NEEDLES, noise_at_marks
@@ -24,15 +25,18 @@ from rsa_vision.detect.needles.pointed import is_slim
 from rsa_vision.detect.needles.tees import GUESS, first_tees, optics_of_tees
 from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.search.candidates import Candidates
-from rsa_vision.types import Bool, Float
+from rsa_vision.flags import MarkerFlag
+from rsa_vision.types import Bool, Float, MarkerImages
 
 CLEAR_JUNCTION = 6.0  # strength from which a junction of three arms tells the polarity; crossing edges reach about 5
 _STRONGEST = 100  # candidates of each polarity that are looked at first
 _BEYOND_DOUBT = 600.0  # evidence of a dozen clear balls or needles; then less than either of the next is no rival
 _NO_RIVAL, _NO_RIVAL_OF_NEEDLES = 60.0, 150.0
-_RIVAL = 0.25  # of the evidence of the better polarity, from which the other is looked at as well
+_RIVAL = 0.1  # of the evidence of the better polarity, from which the other is looked at as well
 _ONE_BALL, _OF_PINS = CAP, 3 * CAP  # evidence of balls, up to which all may be a speck, and of pins, from which they know better
 _LEAST_EVIDENCE = 1.0  # of balls, below which their blur is anybody's
+_CONTESTED = 0.4, 0.15  # of the evidence for a polarity, from which the other may be that of the marks; where both are of one kind
+_ONE_SIZE, _BY_CHANCE = 0.08, 0.01  # logarithms of the radii of balls of one kind; that as many are alike by chance
 _MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: of marks it has next to none
 _REACH = 3.0  # of the radius of the ring on which a junction's arms are seen, that these reach
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
@@ -216,3 +220,40 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
             if needles > 0 or not len(looks.depth):  # else even one faint ball knows more of its blur than nobody
                 optics = of_pins
     return Seen(sign, looks, optics, under, balls + needles + _of_tees(candidates, sign))
+
+
+def likelier(found: list[MarkerImages], evidence: list[float]) -> tuple[int, bool]:
+    """Choose among what was found of either polarity: marks are of one kind, bubbles and pores are of any size; else that of more evidence.
+
+    Parameters
+    ----------
+    found : list of MarkerImages
+        One or two.
+    evidence : list of float
+        For each.
+
+    Returns
+    -------
+    which : int
+    contested : bool
+        The other shows marks as well.
+    """
+    of_one_kind = [_are_of_one_kind(images) for images in found]
+    which, *others = sorted(range(len(found)), key=lambda k: (of_one_kind[k], evidence[k]), reverse=True)
+    least = _CONTESTED[of_one_kind[which]] * evidence[which]
+    return which, any(evidence[k] > least and of_one_kind[k] == of_one_kind[which] for k in others)
+
+
+def _are_of_one_kind(images: MarkerImages) -> bool:
+    """Say whether there are tees, or more balls of one size than chance makes of sizes that lie anywhere within a factor of two."""
+    sure = images.rows(images.flags & ~(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SATURATED) == 0)
+    if np.count_nonzero(sure.shape == "tee") >= LEAST_KNOWN:
+        return True
+    size = np.log(sure.radius_px[sure.shape == "ball"])
+    company = (np.abs(size[:, None] - size) < _ONE_SIZE).sum(axis=1).max(initial=0)
+    return bool(company > 1 and len(size) * bdtrc(company - 2, len(size) - 1, 2 * _ONE_SIZE / np.log(2)) < _BY_CHANCE)
+
+
+def of_doubtful_polarity(images: MarkerImages) -> MarkerImages:
+    """Flag all marks of a film of which nobody knows whether they are the marks, or the gaps between others."""
+    return replace(images, flags=images.flags | MarkerFlag.UNLIKE)
