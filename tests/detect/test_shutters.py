@@ -53,6 +53,40 @@ def test_values_beyond_a_gap_are_left_out() -> None:
     assert noise.before_gap(3000.0, 1.0, 2500.0) is noise
 
 
+def limb(rng: np.random.Generator, n: int = 12) -> tuple[np.ndarray, np.ndarray, Float]:
+    """Film of the logarithm of the exposure, a limb across it, and balls in that: values, the noise's standard deviation, places."""
+    side = 1000
+    cols = np.arange(side) + np.zeros((side, 1))
+    deep = np.exp(-(((cols - side / 2) / 160.0) ** 4)) * (1.3 + 0.5 * np.exp(-(((cols - 520.0) / 40.0) ** 2)))
+    position = np.column_stack([rng.uniform(400, 620, n), 60 + 880 / (n - 1) * np.arange(n)])
+    balls = film_of_balls((side, side), position, np.full(n, 4.0), background=1.0, depth=0.5)
+    exposure = np.exp(-deep) * balls
+    sd = 25.0 / np.sqrt(exposure)
+    return stored(4000 + 900 * np.log(exposure) + sd * rng.standard_normal((side, side)), 12), sd, position
+
+
+def test_noise_where_a_limb_is_darkest() -> None:
+    """The quietest tiles of the darkest class are the least dark: beyond them nothing was known of the noise, 0.7 of it."""
+    film, sd, _ = limb(np.random.default_rng(3))
+    values = np.quantile(film.astype(float), [0.02, 0.05, 0.2])
+    told = np.sqrt(estimate_noise(film, 12).variance_at(values))
+    true = [np.median(sd[np.abs(film - value) < 15]) for value in values]
+    print(values.round(), (told / true).round(2))
+    assert told == pytest.approx(true, rel=0.12)
+
+
+def test_what_lies_beyond_a_gap_is_known_all_the_same() -> None:
+    """Tees on bright film, balls in a limb: the limb is no shutter, and its noise that of the balls."""
+    film, _ = density_behind_shutters(np.random.default_rng(0))
+    noise = estimate_noise(film, 12)
+    field = noise.before_gap(3000.0, -1.0, 2500.0)
+    whole = field.and_beyond(800.0, -1.0, noise)
+    assert whole.variance_at(noise.level[0]) == noise.variance_at(noise.level[0])
+    assert whole.variance_at(np.array([801.0, field.level[0]])) == pytest.approx(field.variance[0])
+    assert (np.diff(whole.level) > 0).all()
+    assert field.and_beyond(5000.0, 1.0, noise) is field
+
+
 def test_edges_of_a_round_collimator_are_no_noise() -> None:
     """Of tiles on its rim there were classes of their own: 40 times the variance of the film, and errors 25 times as large."""
     rng = np.random.default_rng(2)

@@ -64,11 +64,15 @@ def noise_at_marks(film: NDArray[Any], seeds: BallFits, noise: NoiseModel, least
         return noise
     guess = guessed_optics(float(np.median(sure.radius_px)))
     sign, height = float(np.sign(sure.depth[0])), height_of(sure, guess.sigma_px)
-    noise, farthest, tell = beyond_curve(noise, sign, sure.background, height)
+    known, farthest, tell = beyond_curve(noise, sign, sure.background, height)
     sure = sure.rows(tell)
     sure = sure.rows(np.argsort(-sure.significance)[:_ASKED])
-    if _pixels(sure) < least_pixels:
-        return noise
+    told = _told_by(film, sure, seeds, guess, known, farthest) if _pixels(sure) >= least_pixels else known
+    return told.and_beyond(farthest, sign, noise)
+
+
+def _told_by(film: NDArray[Any], sure: BallFits, seeds: BallFits, guess: Optics, noise: NoiseModel, farthest: float) -> NoiseModel:
+    """Carry the noise on to the farthest value, as these candidates tell it; the places of all are not free."""
     places = free_places(film, sure, seeds.position_px, seeds.radius_px + guess.sigma_px, guess, noise)
     reach_px = float(np.median(sure.radius_px)) + guess.sigma_px
     some = [t.values[:: 1 + len(t.values) // _PLACES] for t in places]

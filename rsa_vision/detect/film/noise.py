@@ -29,6 +29,10 @@ _MUCH, _SPECKS = 0.2, 0.2  # part of a film that its background is, part of the 
 _ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many times as many as there are within the fourth of such
 _TAIL = 16  # such distances are less than this part of the values
 _LEVELS = 12  # value classes of the variance curve
+_MORE_AT_ENDS, _APART = 4, 0.5  # classes more, of tiles that differ by so many standard deviations of the noise
+_AS_FINE = 1.3  # of the roughness of the others
+_ENDS = (0.01, 0.99)  # parts of those between which the curve is to be known
+_MOST_MORE = 2.0  # times that it rises beyond its own end
 _BEYOND = 12  # points by which it is carried on
 _CALCULATED = 1e-3  # part of the values to which a film without noise is exact
 _ROUNDED = 0.1  # of the variance of rounding: less is left by no noise
@@ -105,6 +109,19 @@ class NoiseModel:
             return self
         kept = np.setdiff1d(np.arange(len(self.level)), ahead[wide[0] :])
         return replace(self, level=self.level[kept], variance=self.variance[kept])
+
+    def and_beyond(self, value: float, sign: float, other: NoiseModel) -> NoiseModel:
+        """Return the same noise, from its end to a value as it is at the end, and farther on as another model has it.
+
+        Marks may lie there as well: what is beyond a gap may be a limb.
+        """
+        end = -1 if sign > 0 else 0
+        value = sign * max(sign * value, sign * float(self.level[end]))
+        more = sign * (other.level - value) > 0
+        level = np.concatenate([self.level, [value], other.level[more]])
+        level, first = np.unique(level, return_index=True)
+        variance = np.concatenate([self.variance, [self.variance[end]], other.variance[more]])[first]
+        return replace(self, level=level, variance=variance) if more.any() else self
 
     def scatter(self, pixels: Float) -> Float:
         """Return the standard deviation of the mean square of the noise in so many pixels beside each other, in units of the variance.
@@ -225,12 +242,25 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     dof = tiles[0].size - 6  # of the surface
     order = np.argsort(mean)
     level, curve, rough, quiet = [], [], [], []
-    for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
+
+    def add(part: Int) -> None:
         chosen = part[np.argsort(variance[part])][: max(3, len(part) // 4)]
         level.append(float(mean[chosen].mean()))
         curve.append(float(np.median(variance[chosen])))
         rough.append(float(np.median(roughness(tiles[chosen], variance[chosen]))))
         quiet.append(chosen)
+
+    for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
+        add(part)
+    # the quietest of the last class may be far from the end of the values, and marks lie where the film is still darker
+    fine = roughness(tiles, variance) < _AS_FINE * float(np.median(rough))
+    for sign in (-1, 1):
+        for _ in range(_MORE_AT_ENDS):
+            end = int(np.argmax(sign * np.array(level)))
+            beyond = np.flatnonzero(fine & (sign * (mean - level[end]) > _APART * np.sqrt(curve[end])))
+            if len(beyond) < ENOUGH_TILES:
+                break
+            add(beyond)
     ranked = np.argsort(level)
     # steps of one value are not how fine a film's noise is
     finest = min((r for r, v in zip(rough, curve, strict=True) if v > NO_NOISE), default=min(rough))
@@ -244,6 +274,8 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < NO_NOISE else 0.0
+    if np.count_nonzero(fine) >= ENOUGH_TILES:
+        level_array, curve_array = _to_the_ends(level_array, curve_array, np.quantile(mean[fine], _ENDS))
     variance = np.maximum(curve_array / bias, max(QUANTISATION, least))
     lossy, pattern = noise_of_compression(film, LAGS, floor, ceiling), 0.0
     if lossy is not None:  # where it left nothing to see there is no noise either
@@ -278,6 +310,23 @@ def _smooth(level: Float, variance: Float) -> Float:
             else:
                 out[k] = min(out[k], most)
     return out
+
+
+def _to_the_ends(level: Float, variance: Float, ends: Float) -> tuple[Float, Float]:
+    """Carry a variance curve (levels ascending) on to the values that a film reaches, as it rises over as much of itself.
+
+    Evenly in the logarithm. Where it falls towards its end, nothing says how far.
+    """
+    for sign, value in zip((-1, 1), ends.tolist(), strict=True):
+        last, at = (0, 0) if sign < 0 else (-1, len(level))
+        away, apart = sign * (value - level[last]), np.abs(level - level[last])
+        if len(level) > 1 and away > _APART * np.sqrt(variance[last]):
+            base = int(np.argmin(np.where(apart >= min(away, apart.max()), apart, np.inf)))
+            more = min((variance[last] / variance[base]) ** (away / apart[base]), _MOST_MORE)
+            level, variance = (
+                (level, variance) if more <= 1 else (np.insert(level, at, value), np.insert(variance, at, more * variance[last]))
+            )
+    return level, variance
 
 
 def _correlation(rest: Float, variance: Float) -> tuple[Float, float]:

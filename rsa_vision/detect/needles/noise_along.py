@@ -65,15 +65,15 @@ def noise_under_needles(film: NDArray[Any], fits: list[NeedleFit], optics: Optic
         return noise
     sign = float(np.sign(fits[0].depth))
     background, height = np.array([(f.background, f.height) for f in fits]).T
-    noise, farthest, tell = beyond_curve(noise, sign, background, height)
-    arms = [arm for f, of in zip(fits, tell, strict=True) if of for arm in _arms(film, f, optics, noise)]
+    known, farthest, tell = beyond_curve(noise, sign, background, height)
+    arms = [arm for f, of in zip(fits, tell, strict=True) if of for arm in _arms(film, f, optics, known)]
 
     def under(trial: NoiseModel) -> float:
         return float(np.median([np.mean(a.bent**2 / trial.variance_at(a.level)) / a.beside for a in arms]))
 
-    if not arms or not worth_it(under(noise), 1.0, sum(len(a.bent) for a in arms)):
-        return noise
-    return carried_to(noise, farthest, under, 1.0)
+    if arms and worth_it(under(known), 1.0, sum(len(a.bent) for a in arms)):
+        known = carried_to(known, farthest, under, 1.0)
+    return known.and_beyond(farthest, sign, noise)
 
 
 def _arms(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> list[_Arm]:
