@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.balls.unlike import of_odd_size, too_deep, too_pale
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.needles.arms import lone_tees
+from rsa_vision.detect.needles.fits import unfit
 from rsa_vision.flags import MarkerFlag
 
 from .films import film_of_balls, grid_of_balls, stored
@@ -133,3 +136,19 @@ def test_a_few_of_half_the_size_of_two_dozen_are_dots_and_not_beads(small: int, 
     assert odd[24:].all() == odd[24:].any() == flagged
     assert not of_odd_size(size[:24], np.full(24, 0.2**2)).any()
     assert not of_odd_size(np.append(np.full(24, 6.0), np.full(4, 4.5)), np.full(28, 0.02**2)).any()  # 0.8 and 0.6 mm
+
+
+def test_tees_among_balls_need_company() -> None:
+    """Letters of lead have corners like tees; those of a set are as wide as each other and parallel."""
+    arms = np.deg2rad([90.0, 180.0, 0.0])
+
+    def tee(turn: float, half_width: float) -> NeedleFit:
+        return unfit(np.zeros(2), arms + turn, NeedleShape(half_width, 20.0))
+
+    pin = unfit(np.zeros(2), arms[:1], NeedleShape(2.5, 20.0))
+    two, three = [tee(0.0, 2.5), tee(0.1, 2.4)], [tee(0.0, 2.5), tee(0.1, 2.4), tee(-0.1, 2.6)]
+    assert lone_tees([*two, pin], np.ones(3, bool)).tolist() == [True, True, False]
+    assert not lone_tees([*three, pin], np.ones(4, bool)).any()
+    assert lone_tees([*two, tee(1.5, 2.5)], np.ones(3, bool)).all()
+    assert lone_tees([*two, tee(0.0, 4.5)], np.ones(3, bool)).all()
+    assert lone_tees(three, np.array([True, True, False])).tolist() == [True, True, False]

@@ -18,8 +18,8 @@ from rsa_vision.detect.marks.resolve import doubt_of_number
 from rsa_vision.detect.marks.settle import STRUCTURE
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.arms import meet_others, perhaps_arms
-from rsa_vision.detect.needles.fits import excess_of, significant_misfit
+from rsa_vision.detect.needles.arms import lone_tees, meet_others, perhaps_arms
+from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, excess_of, significant_misfit
 from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
@@ -27,6 +27,7 @@ from rsa_vision.types import Bool, Float, MarkerImages
 EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
+_LINE_PX = 1.01 * LEAST_HALF_WIDTH_PX  # half width of a needle that is a line
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
@@ -121,10 +122,11 @@ def table_of(
     arms = np.array([len(t.angles) for t in tees])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), NEEDLES_ALIKE)
-    flags[n:][perhaps_arms(tees, junctions) | meet_others(film, tees)] |= MarkerFlag.UNLIKE
-    if np.count_nonzero(arms == 1) < LEAST_OF_A_KIND and n >= COMPANY:  # among balls a pin or two are more likely ends of rods
-        flags[np.flatnonzero(arms == 1) + n] |= MarkerFlag.UNLIKE
+    flags[n:][perhaps_arms(tees, junctions) | meet_others(film, tees) | (radius[n:] <= _LINE_PX)] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
+    if n >= COMPANY:  # among balls a pin or two are more likely ends of rods, and a tee or two are letters of lead
+        few = np.count_nonzero(arms == 1) < LEAST_OF_A_KIND
+        flags[n:][((arms == 1) & few) | lone_tees(tees, ~poor[n:])] |= MarkerFlag.UNLIKE
     unknown = ~np.isfinite(covariance).all(axis=(1, 2))
     poor |= unknown
     covariance[unknown] = 0.0

@@ -1,4 +1,4 @@
-"""Pins that may be what was seen of a tee: by tees beside them, by what else meets at their tips."""
+"""Pins that may be what was seen of a tee, by tees beside them, by what else meets at their tips; and tees that may be letters."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.needles.sets import LEAST_ALIKE
 from rsa_vision.types import Bool, Float
 
 _FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these may be what is seen of a tee; radians
 _AT_TIP = 0.35  # of a pin's length, from its tip to where three arms meet
 _AWAY = np.array([0.35, 0.5, 0.65])  # of a pin's length from its tip, where another is sought
+_AS_WIDE = 0.35  # logarithms of the half widths of the tees of a set, which stand for depth
 _WAYS, _BESIDE, _OWN = 72, 6, 9  # directions; steps of these to what lies beside an arm, and within which all is the pin itself
 _AS_HIGH = 0.5  # of the pin's own height there
 
@@ -66,3 +68,24 @@ def _meets_others(film: NDArray[Any], pin: NeedleFit) -> bool:
     above = seen - np.maximum(np.roll(seen, _BESIDE, axis=1), np.roll(seen, -_BESIDE, axis=1))
     as_high: Bool = np.all(above > _AS_HIGH * above[:, :1], axis=0)
     return bool(above[:, 0].min() > 0 and as_high[_OWN : 1 - _OWN].any())
+
+
+def lone_tees(needles: list[NeedleFit], sure: Bool) -> Bool:
+    """Say which tees have not two sure ones beside them that are about as wide and parallel, as those of a set are.
+
+    Parameters
+    ----------
+    needles : list of NeedleFit
+        Pins are none.
+    sure : ndarray of bool, shape (n,)
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    tee = np.array([len(f.angles) > 1 for f in needles], bool)
+    width, angle = np.log([f.shape.half_width_px for f in needles]), np.array([f.angles[0] for f in needles])
+    parallel = np.abs(np.angle(np.exp(1j * (angle[:, None] - angle)))) < _PARALLEL
+    alike = parallel & (np.abs(width[:, None] - width) < _AS_WIDE) & tee & sure
+    alike[np.diag_indices(len(tee))] = True
+    return np.asarray(tee & (alike.sum(axis=1) < LEAST_ALIKE))

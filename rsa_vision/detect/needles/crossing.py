@@ -16,7 +16,7 @@ from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.needles import Images, NeedleFit, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.fits import PROMISING, between, explains, scored, step_of
+from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, PROMISING, between, explains, scored, step_of
 from rsa_vision.types import Float, Int
 
 _STEPS, _QUICK_STEPS = 16, 5
@@ -261,6 +261,6 @@ def moved(needles: Sequence[NeedleFit], by: Float, half: int) -> list[NeedleFit]
 
 def _moved(fit: NeedleFit, delta: Float, half: int) -> NeedleFit:
     wider, longer = between(delta[2], -0.5, 0.5), between(delta[3], -2.0, 2.0)
-    width = between(fit.shape.half_width_px + wider, 0.6, 0.3 * fit.shape.length_px)
+    width = between(fit.shape.half_width_px + wider, LEAST_HALF_WIDTH_PX, 0.3 * fit.shape.length_px)
     shape = replace(fit.shape, half_width_px=width, length_px=between(fit.shape.length_px + longer, 3.0, half / 1.05))
     return replace(fit, position_px=fit.position_px + delta[:2], shape=shape, angles=fit.angles + delta[-1])

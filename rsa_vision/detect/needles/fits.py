@@ -16,6 +16,7 @@ from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, arm_images,
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float
 
+LEAST_HALF_WIDTH_PX = 0.6  # a needle that comes out as thin as that has no width of its own
 _STEPS = 14
 _DEEPER = 2.0  # times the height of an image: a depth beyond that is what thin opacity would come to, and no measure
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
@@ -122,7 +123,7 @@ def _fitted(
             weight = 1.0 / noise.variance_at(theta @ linear)
         scale = min(1.0, far / max(np.abs(delta[:2]).max(), 1e-9), 0.15 / max(abs(delta[4]), 1e-9))
         tip += scale * delta[:2]
-        width = between(shape.half_width_px + between(scale * delta[2], -0.5, 0.5), 0.6, 0.3 * shape.length_px)
+        width = between(shape.half_width_px + between(scale * delta[2], -0.5, 0.5), LEAST_HALF_WIDTH_PX, 0.3 * shape.length_px)
         longer = between(scale * delta[3], -2.0, 2.0)
         shape = replace(shape, half_width_px=width, length_px=between(shape.length_px + longer, 3.0, half / 1.05))
         angles += scale * delta[4]

@@ -25,7 +25,7 @@ from rsa_vision.detect.needles.equations import (
     Expected,
     own_parameters,
 )
-from rsa_vision.detect.needles.fits import between
+from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, between
 from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_arms
 from rsa_vision.types import Float
 
@@ -210,7 +210,7 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
     out = []
     for f, part in zip(members, scale * parts, strict=True):
         width, length = f.shape.half_width_px, f.shape.length_px
-        width = between(width + between(part[2] + width * wider, -0.5, 0.5), 0.6, 0.3 * length)
+        width = between(width + between(part[2] + width * wider, -0.5, 0.5), LEAST_HALF_WIDTH_PX, 0.3 * length)
         ways = np.append(np.zeros(WAYS - each + ends), part[ends:])  # no leans where each arm has a direction of its own
         angles, lengths = moved_arms(f, ways) if arms == ARMS else (f.angles, f.shape.arms)
         length = max(length + between(part[3] + length * longer, -2.0, 2.0), 3.0)
