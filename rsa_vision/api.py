@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsa_vision.api_detect import detect
 from rsa_vision.api_motion import export, growth, motion, precision, write_motion
-from rsa_vision.batch import Outcome, Task, run, with_copies_reviewed
+from rsa_vision.batch import Outcome, Task, run
 from rsa_vision.errors import UsageError
 from rsa_vision.ordering import natural_key
 from rsa_vision.preparation import cage_content, default_study, group, load_geometry, refuse_unbuilt, settle
@@ -121,6 +121,8 @@ def measure(
         If nothing can be measured at all: wrong options, no cage, no film, results that cannot be written. A film that cannot be used is a
         failed examination, not an exception.
     """
+    from rsa_vision.copies import with_copies_reviewed  # late: it needs the mathematics
+
     started = datetime.now(UTC)
     folder, out = Path(folder), Path(out)
     refuse_unbuilt(method, dask, jobs, timeout_s)

@@ -6,7 +6,7 @@ import signal
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, as_completed
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from hashlib import sha256
 from multiprocessing import get_context
 from pathlib import Path
@@ -24,7 +24,6 @@ from rsa_vision.threads import one_thread_each
 if TYPE_CHECKING:
     from rsa_vision.cages import Cage
     from rsa_vision.cameras import Camera
-    from rsa_vision.verdict import Finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,42 +152,6 @@ def measure_task(task: Task) -> Outcome:
 
 def _pixels(films: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     return {film["file"]: film["pixels"] for film in films if "pixels" in film}
-
-
-def with_copies_reviewed(exams: Sequence[ExamFiles], outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """Have those examinations reviewed whose films are given twice: no two exposures are alike to the last bit.
-
-    Of their pixels; the files may say something else.
-
-    Parameters
-    ----------
-    exams : sequence of ExamFiles
-    outcomes : sequence of Outcome
-        In the same order.
-
-    Returns
-    -------
-    list of Outcome
-        With the reason ``film-duplicate``; films of the cage alone may serve several examinations.
-    """
-    from rsa_vision.followup import judged  # late: it needs the mathematics
-
-    same: dict[str, list[tuple[int, str]]] = {}
-    for k, (files, outcome) in enumerate(zip(exams, outcomes, strict=True)):
-        for film in files.films if outcome.status != "failed" else ():
-            name = film.path.name
-            if not film.cage_only and (content := outcome.pixels.get(name) or outcome.inputs.get(name)):  # older results have files only
-                same.setdefault(content, []).append((k, name))
-    findings: dict[int, list[Finding]] = {}
-    for copies in same.values():
-        for i, (k, name) in enumerate(copies if len(copies) > 1 else ()):
-            others = ", ".join(sorted({printable(other) for j, (_, other) in enumerate(copies) if j != i}))
-            findings.setdefault(k, []).append(("film-duplicate", f"{printable(name)} is the same film as {others}"))
-
-    def judged_again(outcome: Outcome, found: Sequence[Finding]) -> Outcome:
-        return replace(outcome, rows={**outcome.rows, "exams": [judged(outcome.rows["exams"][0], found)]})
-
-    return [judged_again(outcome, findings[k]) if k in findings else outcome for k, outcome in enumerate(outcomes)]
 
 
 def _measure(task: Task, started: float) -> tuple[Rows, list[dict[str, Any]], list[bytes]]:

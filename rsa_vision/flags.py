@@ -61,7 +61,7 @@ REASONS: Final[dict[str, str]] = {
     "film-missing": "a focus has no film; look for a missing or misnamed file",
     "film-unexpected": "more films than foci, or a shared film beside single ones; look at the file names",
     "film-name": "the file name does not say subject and examination; rename it SUBJECT_EXAM[_fK].EXT or set file_pattern in study.toml",
-    "film-duplicate": "the same film is given twice; look which of the examinations the film belongs to",
+    "film-duplicate": "the same film, or exposure, is given twice; look which of the examinations it belongs to",
     "no-markers": "no marker image was found on a film; look at the film, its polarity and response",
     "cage-not-found": "the marks of the cage are not on the film; is it this cage, this orientation, and a film as the detector gave it?",
     "cage-film-differs": "the film with _cage has other pixels than the film without; export both whole, at one pixel pitch",
