@@ -21,6 +21,8 @@ from rsa_vision.settings import Study
 from rsa_vision.store import write_atomic, write_run, write_tables
 
 if TYPE_CHECKING:
+    from rsa_vision.cages import Cage
+    from rsa_vision.cameras import Camera
     from rsa_vision.proposal import Proposal
 __all__ = [
     "Summary",
@@ -137,7 +139,7 @@ def measure(
     depends_on = {"settings": _described(settled), "geometry": about, "method": method}
     tasks = [Task(files, settled, geometry, depends_on, out, redo) for files in grouping.exams]
     outcomes = run(tasks, jobs, timeout_s, lambda outcome: watch(outcome, len(tasks)) if watch else None)
-    outcomes = with_copies_reviewed(grouping.exams, _followed_up(outcomes, known, settled))
+    outcomes = with_copies_reviewed(grouping.exams, _turns_reviewed(_followed_up(outcomes, known, settled), geometry))
     write_tables(out, (outcome.rows for outcome in outcomes))
     write_motion(out, settled)
     options = {"method": method, "segments": _hashed(segments), "jobs": jobs, "redo": redo, "timeout_s": timeout_s}
@@ -216,6 +218,7 @@ def reconstruct(
         outcomes.append(Outcome(subject, exam, rows))
     if known is not None:  # names that somebody gave stand unless the segments are to give them
         outcomes = _followed_up(outcomes, known, settled)
+    outcomes = _turns_reviewed(outcomes, loaded)
     write_tables(out, (outcome.rows for outcome in outcomes))
     write_motion(out, settled)
     record = _record("reconstruct", started, points, study_file, settled, {"cage": cage_content(loaded)})
@@ -302,6 +305,15 @@ def _followed_up(outcomes: Sequence[Outcome], segments: Segments | None, study: 
     from rsa_vision.followup import follow_up
 
     every = follow_up([outcome.rows for outcome in outcomes], segments, study.limits)
+    return [replace(outcome, rows=rows) for outcome, rows in zip(outcomes, every, strict=True)]
+
+
+def _turns_reviewed(outcomes: Sequence[Outcome], geometry: Cage | Mapping[int, Camera]) -> list[Outcome]:
+    from rsa_vision.cage_symmetry import turns
+    from rsa_vision.cages import Cage
+    from rsa_vision.turned import with_turned_reviewed
+
+    every = with_turned_reviewed([outcome.rows for outcome in outcomes], turns(geometry) if isinstance(geometry, Cage) else ())
     return [replace(outcome, rows=rows) for outcome, rows in zip(outcomes, every, strict=True)]
 
 

@@ -76,6 +76,30 @@ def symmetries(cage: Cage) -> tuple[Symmetry, ...]:
     return tuple(symmetry for plane in cage.plane for symmetry in _of_plane(cage, plane))
 
 
+def turns(cage: Cage) -> tuple[Float, ...]:
+    """Return the rotations of everything that films of a cage show if all foci's were turned, and that its marks cannot tell.
+
+    Parameters
+    ----------
+    cage : Cage
+
+    Returns
+    -------
+    tuple of ndarray of shape (3, 3)
+        In the laboratory frame. Empty where single films can be turned only: then rays miss each other.
+    """
+    whole = [symmetry for symmetry in symmetries(cage) if symmetry.kind == "rotation" and set(symmetry.foci) == set(cage.foci)]
+    return tuple(_in_space(symmetry.matrix[:, :2], cage.plane_of(symmetry.foci[0])) for symmetry in whole)
+
+
+def _in_space(linear: Float, plane: Plane) -> Float:
+    u, v = plane.lab_from_plane()[1]
+    normal = plane.normal()
+    turned = np.column_stack([u, v]) @ linear @ np.stack([u, v])
+    rotation: Float = turned + np.outer(normal, normal)
+    return rotation
+
+
 def _of_plane(cage: Cage, plane: Plane) -> list[Symmetry]:
     origin, basis = plane.lab_from_plane()
     frame = np.vstack([basis, plane.normal()])

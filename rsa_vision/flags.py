@@ -65,7 +65,7 @@ REASONS: Final[dict[str, str]] = {
     "no-markers": "no marker image was found on a film; look at the film, its polarity and response",
     "cage-not-found": "the marks of the cage are not on the film; is it this cage, this orientation, and a film as the detector gave it?",
     "cage-film-differs": "the film with _cage has other pixels than the film without; export both whole, at one pixel pitch",
-    "cage-ambiguous": "two ways of naming the cage marks explain the film nearly as well; set orientation, or look at the overlay",
+    "cage-ambiguous": "two ways of naming the cage marks fit equally well, or a follow-up is turned; set orientation, look at the overlay",
     "film-stretched": "the film is stretched against its pixel pitch: another build of the cage, or a wrong pixel pitch",
     "calibration-invalid": "the camera calibration does not belong to these films; look at the calibration files",
     "few-fiducials": "four fiducial marks were found: no redundancy, a gross error would not show",
