@@ -23,6 +23,7 @@ from rsa_vision.segments import Segment, Segments, segments_of
 from rsa_vision.settings import Limits
 from rsa_vision.sighted import HiddenMarker, find_sightings, hidden_of, hidden_since, image_row, missing_row, predicted_row
 from rsa_vision.tables import Row, Rows, name_of, split_name
+from rsa_vision.types import Float
 from rsa_vision.verdict import Finding, conclude
 
 UNRELATED: Final = 8  # markers of which not one is found again, nor nearly: another object, not one whose few markers moved
@@ -42,6 +43,7 @@ class _Exam:
     hidden: list[HiddenMarker] = field(default_factory=list)
     missing: set[str] = field(default_factory=set)  # known markers that were not found
     unsure: set[str] = field(default_factory=set)  # names that may be second ones of a marker
+    turns: dict[str, Float] = field(default_factory=dict)  # rotations of known segments
     told: str = ""  # what a reader should know of its pairs though nothing is wrong
 
 
@@ -78,7 +80,7 @@ def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) 
             exam = _open(rows)
             if known is not None:
                 exam.told = _settled(exams[index], rows)
-                _name_by_segments(exam, known, limits)
+                _name_by_segments(exam, earlier, known, limits)
             used = _name_by_earlier(exam, earlier, used, limits)
             earlier.append(exam)
             result[index] = _renamed(exam)
@@ -99,18 +101,25 @@ def _settled(before: Rows, after: Rows) -> str:
     return "the known segments decide the doubtful pairs"
 
 
-def _name_by_segments(exam: _Exam, segments: Sequence[Segment], limits: Limits) -> None:
+def _name_by_segments(exam: _Exam, earlier: Sequence[_Exam], segments: Sequence[Segment], limits: Limits) -> None:
     if not segments:
         exam.findings.append(("marker-mismatch", f"segments.csv knows no segment of subject {exam.rows['exams'][0]['subject']}"))
         return
     bodies = [Cloud.exact(segment.position_mm) for segment in segments]
-    matched = match_segments(bodies, exam.cloud, limits.posterior)
+    turns = {name: turn for other in earlier for name, turn in other.turns.items()}  # the last ones
+    before = [turns.get(segment.name) for segment in segments]
+    matched = match_segments(bodies, exam.cloud, limits.posterior, before)
+    if any(turn is None for turn in before):
+        before = [_beside(k, matched) if turn is None else turn for k, turn in enumerate(before)]
+        matched = match_segments(bodies, exam.cloud, limits.posterior, before)
     sightings = find_sightings(exam.rows, exam.cloud, bodies, matched, limits)
     for segment, body, known, sighting in zip(segments, bodies, matched, sightings, strict=True):
         for i, a in (*known.pairs, *known.loose, *sighting.pairs):
             exam.names[a] = f"{segment.name}/{segment.markers[i]}"
         for _, a in known.loose:
             exam.flags[a] |= MarkerFlag.LOOSE
+        if (placement := known.placement or sighting.placement) is not None:
+            exam.turns[segment.name] = placement.rotation
         if known.placement is None and sighting.placement is not None:
             known = replace(known, doubtful=())  # single rays decided
         for _, a in known.doubtful:
@@ -151,6 +160,13 @@ def _segment_findings(segment: Segment, known: Known, sighting: Sighting, limits
     elif known.lost:
         findings.append(("marker-mismatch", f"segment {segment.name}: {told(known.lost)} not found"))
     return findings
+
+
+def _beside(index: int, matched: Sequence[Known]) -> Float | None:
+    """Return the rotation of the largest other segment: those of one patient may be given as they are to each other."""
+    others = [known for k, known in enumerate(matched) if k != index and known.placement is not None]
+    largest = max(others, key=lambda known: len(known.pairs), default=None)
+    return None if largest is None or largest.placement is None else largest.placement.rotation
 
 
 def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: Limits) -> int:

@@ -72,8 +72,8 @@ def find_sightings(rows: Rows, cloud: Cloud, bodies: Sequence[Cloud], matched: S
             present = PRESENT if any(other.placement is not None for other in matched) else 0.5
             sighting = find_with_rays(body, cloud.rows(mine), rays, volume, limits.posterior, around_mm=cloud.position_mm, present=present)
             sighting = replace(sighting, pairs=tuple((i, int(mine[a])) for i, a in sighting.pairs))
-            if known.doubtful and not sighting.decisive:
-                sighting = nothing  # the doubt about the points says it all
+            if not (sighting.sights if sighting.decisive else not known.doubtful):
+                sighting = nothing  # points tell nothing here that they did not tell by themselves, and their doubt says it all
         found.append(sighting if sighting.decisive else replace(nothing, decisive=False))
     claims = [claim for one in found for claim in {("image", rays.image[r]) for _, r in one.sights} | {("point", a) for _, a in one.pairs}]
     return [

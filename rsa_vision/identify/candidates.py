@@ -7,6 +7,8 @@ with the right distances are listed as they are, and with what their pose explai
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import permutations
 from typing import Final
 
 import numpy as np
@@ -24,7 +26,7 @@ from rsa_vision.identify.poses import (
     place_many,
     pose_jacobian,
 )
-from rsa_vision.types import Bool
+from rsa_vision.types import Bool, Float
 
 THIN_MM: Final = 1.0  # height of a triangle that determines no pose
 ALIKE: Final = 4.0  # variances of predicted places are alike up to this ratio
@@ -74,6 +76,61 @@ def candidate_poses(body: Cloud, points: Cloud, log_worth: float) -> list[tuple[
             found |= poses
         front = {max((pairs for pairs in near if pairs in found), key=value) for near in beside.values()} - climbed
     return list(found.items())
+
+
+def loose_triples(body: Cloud, points: Cloud, triples: Iterable[Pairs], chance: float, reach_mm: float) -> list[tuple[Pairs, Placement]]:
+    """List all ways to name the points of triples by their markers if two keep their distance, and the third has moved in its bone.
+
+    Parameters
+    ----------
+    body, points : Cloud
+    triples : iterable of tuple of (marker, point)
+        Three pairs each.
+    chance : float
+        Probability that a marker has moved.
+    reach_mm : float
+        How far it may be from its place.
+
+    Returns
+    -------
+    list of (pairs, Placement)
+        The one that has moved is the last pair. The two others leave open how the body is turned about their line: it is turned so that
+        the third is nearest to its point, and the likelihood holds all turns within reach, the density of its point there, and the chance.
+    """
+    sets = {(tuple(i for i, _ in triple), tuple(sorted(a for _, a in triple))) for triple in triples}
+    every = [
+        (three, order)
+        for (i, j, k), theirs in sorted(sets)
+        for three in ((i, j, k), (i, k, j), (j, k, i))
+        for order in permutations(theirs)
+    ]
+    marks, hits = np.array(every, np.int64).reshape(-1, 2, 3).swapaxes(0, 1)  # (t, 3)
+    _, foot, height = _about_line(body.position_mm[marks])
+    (axis, _, away), there = _about_line(points.position_mm[hits]), points.position_mm[hits]
+    side = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    nearest = there[:, :2].mean(axis=1) + foot * axis + np.linalg.norm(height, axis=1, keepdims=True) * side
+    thin = np.minimum(np.linalg.norm(height, axis=1), np.linalg.norm(away, axis=1)) < THIN_MM
+    near = np.flatnonzero(~thin & (np.linalg.norm(there[:, 2] - nearest, axis=1) < reach_mm))
+    if not len(near):
+        return []
+    ball = points.covariance_mm2[hits[near, 2]] + reach_mm**2 / 5 * np.eye(3)  # a ball has this covariance
+    turned = Cloud(np.concatenate([points.position_mm, nearest[near]]), np.concatenate([points.covariance_mm2, ball]))
+    at = np.column_stack([hits[near, :2], len(points) + np.arange(len(near))])
+    named = [tuple(zip(mine, theirs, strict=True)) for mine, theirs in zip(marks[near].tolist(), hits[near].tolist(), strict=True)]
+    return [
+        (pairs, replace(placement, log_likelihood=placement.log_likelihood + float(np.log(chance))))
+        for pairs, placement in zip(named, place_many(body, turned, marks[near], at), strict=True)
+        if placement
+    ]
+
+
+def _about_line(three_mm: Float) -> tuple[Float, Float, Float]:
+    """Return the directions, shape (t, 3), from first to second points, how far (t, 1) thirds are along them from the middle, and off."""
+    axis = three_mm[:, 1] - three_mm[:, 0]
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    arm = three_mm[:, 2] - three_mm[:, :2].mean(axis=1)
+    along = (arm * axis).sum(axis=1, keepdims=True)
+    return axis, along, arm - along * axis
 
 
 def _compatible(body: Cloud, points: Cloud) -> Bool:

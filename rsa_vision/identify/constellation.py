@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit, gammaln
 
 from rsa_vision.geometry.rigid import LEAST_POINTS
-from rsa_vision.identify.candidates import candidate_poses, disjoint
+from rsa_vision.identify.candidates import candidate_poses, disjoint, loose_triples
 from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import GATE, Cloud, Pairs, Placement, nearness, place, volume_mm3
 from rsa_vision.types import Bool, Float, Int
@@ -24,6 +24,8 @@ STRAY: Final = 3.0  # expected points that belong to nothing known, at least
 LOOSE: Final = 0.02  # probability that a marker found has moved in its bone
 LOOSE_MM: Final = 3.0  # how far a marker may have moved in its bone and still be known by its place
 LOOSE_SIGMA: Final = 4.0  # residual of a marker that has moved
+TURN_RAD: Final = 0.5  # sd of the rotation of a body about each axis since it was seen before,
+TURNED: Final = 1e-3  # but for so many that are turned anyhow
 NEGLIGIBLE: Final = -7.0  # log odds below which an assignment is not counted
 MOST_RIVALS: Final = 60  # assignments of one body that compete
 MOST_PARTS: Final = 8  # overlapping bodies that are taken apart
@@ -54,7 +56,7 @@ class Known:
     placement: Placement | None
 
 
-def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -> list[Known]:
+def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float, before: Sequence[Float | None] | None = None) -> list[Known]:
     """Find the markers of known segments among points; each segment has a pose of its own.
 
     Parameters
@@ -64,6 +66,9 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -
     points : Cloud
     posterior : float
         Least probability of a name.
+    before : sequence of (ndarray of shape (3, 3) or None), optional
+        Rotation that each segment should nearly have, as in an earlier examination: names that turn it over have to hold against that, too.
+        It makes no name likelier.
 
     Returns
     -------
@@ -72,21 +77,32 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float) -
     """
     volume = volume_mm3(points)
     stray = STRAY + max(0, len(points) - sum(map(len, segments)))
-    rivals = [
-        (index, odds, rigid, loose)
-        for index, body in enumerate(segments)
-        for odds, rigid, loose in _with_one_loose(body, points, likely_groups(body, points, volume, stray), volume / stray)
-    ]
-    claims = [(*(a for _, a in (*rigid, *loose)), len(points) + index) for index, _, rigid, loose in rivals]
-    packing = pack(claims, np.array([odds for _, odds, _, _ in rivals]))
-    chances = np.nan_to_num(packing.posterior)
+    rivals = [(index, *rival) for index, body in enumerate(segments) for rival in _rivals(body, points, volume, stray)]
+    claims = [(*(a for _, a in (*rigid, *loose)), len(points) + index) for index, _, rigid, loose, _ in rivals]
+    since = [None] * len(segments) if before is None else before
+    usual = [0.0 if (turn := since[index]) is None else _log_usual(turn, after) for index, *_, after in rivals]
+    chosen, chances = _packed(claims, [odds for _, odds, *_ in rivals], usual)
     known = []
     for index, segment in enumerate(segments):
         mine = [g for g, rival in enumerate(rivals) if rival[0] == index]
-        names = _names([(*rivals[g][2], *rivals[g][3]) for g in mine], chances[mine])
-        rigid, loose = next((rivals[g][2:] for g in mine if packing.chosen[g]), ((), ()))
+        names = _names([(*rivals[g][2], *rivals[g][3]) for g in mine], chances[:, mine])
+        rigid, loose = next((rivals[g][2:4] for g in mine if chosen[g]), ((), ()))
         known.append(_known(segment, points, rigid, loose, names, posterior))
     return _with_loose(segments, points, known)
+
+
+def _packed(claims: Sequence[tuple[int, ...]], odds: Sequence[float], usual: Sequence[float]) -> tuple[Bool, Float]:
+    """Return the groups of the best explanation, and chances of all, shape (2, g): any rotation being as likely, and usual ones more."""
+    packing = pack(claims, np.array(odds))
+    as_usual = pack(claims, np.array(odds) + usual) if any(usual) else packing
+    return packing.chosen, np.nan_to_num([packing.posterior, as_usual.posterior])
+
+
+def _log_usual(before: Float, after: Float) -> float:
+    """Return the log density of a rotation after another one, over that of any rotation."""
+    squared_rad = np.arccos(np.clip((np.trace(after @ before.T) - 1) / 2, -1, 1)) ** 2
+    small = 8 * np.pi**2 / (2 * np.pi * TURN_RAD**2) ** 1.5 * np.exp(-squared_rad / (2 * TURN_RAD**2))
+    return float(np.log(TURNED + (1 - TURNED) * small))
 
 
 def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) -> list[tuple[float, Pairs, Placement]]:
@@ -110,21 +126,25 @@ def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) ->
     return [(odds, pairs, found[pairs]) for odds, pairs in rivals[:MOST_RIVALS]]
 
 
-def _with_one_loose(
-    segment: Cloud, points: Cloud, groups: Sequence[tuple[float, Pairs, Placement]], volume_of_a_stray: float
-) -> list[tuple[float, Pairs, Pairs]]:
-    """Add to assignments those with one marker more, that has moved in its bone: its point lies anywhere near its place.
+def _rivals(segment: Cloud, points: Cloud, volume: float, stray: float) -> list[tuple[float, Pairs, Pairs, Float]]:
+    """List the assignments of a segment, as they are and with one marker more that has moved in its bone: anywhere near its place.
 
-    Without them a wrong assignment of all markers competes with the true one of those that have not moved, and with a stray point that
-    happens to lie where the marker that moved is missing.
+    Without the latter a wrong assignment of all markers competes neither with the true one of those that have not moved, which may be two
+    alone, nor with a stray point that happens to lie where the marker that moved is missing. With each goes the body's rotation.
     """
-    gain = np.log(LOOSE * FOUND / (1 - FOUND) * volume_of_a_stray / (4 / 3 * np.pi * LOOSE_MM**3))
-    rivals: list[tuple[float, Pairs, Pairs]] = [(odds, pairs, ()) for odds, pairs, _ in groups]
+    gain = np.log(LOOSE * FOUND / (1 - FOUND) * volume / stray / (4 / 3 * np.pi * LOOSE_MM**3))
+    groups = likely_groups(segment, points, volume, stray)
+    rivals: list[tuple[float, Pairs, Pairs, Float]] = []
     for odds, pairs, placement in groups:
         lost, free = _others(len(segment), dict(pairs).keys()), _others(len(points), dict(pairs).values())
         away = np.linalg.norm(points.position_mm[free] - placement.predict(segment.position_mm[lost])[0][:, None], axis=-1)
-        rivals += [(odds + float(gain), pairs, ((int(lost[i]), int(free[a])),)) for i, a in np.argwhere(away < LOOSE_MM).tolist()]
-    return sorted(rivals, key=lambda rival: (-rival[0], rival[1:]))[:MOST_RIVALS]
+        near = [((int(lost[i]), int(free[a])),) for i, a in np.argwhere(away < LOOSE_MM).tolist()]
+        rivals += [(odds, pairs, (), placement.rotation), *((odds + float(gain), pairs, one, placement.rotation) for one in near)]
+    triples = [pairs for _, pairs, _ in groups if len(pairs) == LEAST_POINTS]
+    for pairs, placement in loose_triples(segment, points, triples, LOOSE, LOOSE_MM):
+        rivals.append((log_odds(len(segment), placement, pairs, volume, stray), pairs[:2], pairs[2:], placement.rotation))
+    rivals = [rival for rival in rivals if rival[0] > NEGLIGIBLE]
+    return sorted(rivals, key=lambda rival: (-rival[0], rival[1:3]))[:MOST_RIVALS]
 
 
 def log_odds(n: int, placement: Placement, pairs: Pairs, volume: float, stray: float) -> float:
@@ -145,7 +165,7 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
     Returns
     -------
     bodies : list of tuple of (earlier point, point)
-        Decisive names by the rigid group that shows them.
+        Decisive names by the rigid group that shows them; none turned over since, unless no other explanation comes near.
     doubtful : ndarray of bool, shape (m,)
         Points that fit an earlier one, but not decisively.
 
@@ -164,11 +184,17 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
         mine, theirs = _others(len(before), named.keys()), _others(len(points), named.values())
         left = candidate_poses(before.rows(mine), points.rows(theirs), float(np.log(volume / max(len(theirs), 1)))) if named else []
         again = [(tuple((int(mine[i]), int(theirs[a])) for i, a in pairs), placement) for pairs, placement in left]
-        rivals = _additions(before, points, {**dict(listed), **dict(again)}, named, volume)
-        chances, chosen = _summed(rivals[:MOST_RIVALS], len(points))
-        odds = {pairs: value for value, pairs in rivals}
-        chances = _with_uncounted(chances, {body: odds[body] for body in chosen}, rivals[MOST_RIVALS:])
-        found = [kept for body in chosen if (kept := tuple(pair for pair in body if chances[pair] >= posterior))]
+        rigid = {**dict(listed), **dict(again)}
+        rivals = _additions(before, points, rigid, named, volume)
+        few, uncounted = rivals[:MOST_RIVALS], rivals[MOST_RIVALS:]
+        triples = [pairs for _, pairs, _ in few if pairs in rigid and len(pairs) == LEAST_POINTS]
+        turned = dict(loose_triples(before, points, triples, LOOSE, LOOSE_MM))
+        competing = [*few, *_additions(before, points, turned, named, volume)]
+        chances, best = _summed(competing, len(points))
+        chosen = [competing[g][1] for g in best]
+        odds = {few[g][1]: few[g][0] for g in best if g < len(few)}  # what is best with a loose marker of three gets no names
+        chances = _with_uncounted(chances, odds, uncounted)
+        found = [kept for body in odds if (kept := tuple(pair for pair in body if chances[pair] >= posterior))]
         if not found:
             break
         bodies += found
@@ -195,15 +221,15 @@ def _parts(before: Cloud, points: Cloud, listed: Sequence[tuple[Pairs, Placement
 
 def _additions(
     before: Cloud, points: Cloud, listed: Mapping[Pairs, Placement], named: Mapping[int, int], volume: float
-) -> list[tuple[float, Pairs]]:
-    """Return the log odds of what each group adds to the names, that contradict none.
+) -> list[tuple[float, Pairs, float]]:
+    """Return the log odds of what each group adds to the names, that contradict none, and how usual its rotation is if it has its own.
 
     The points that are left lie as close to each other as all do: few of them do not make it less of a chance that three fit.
     """
     n, m = len(before) - len(named), len(points)
     owner = {a: i for i, a in named.items()}
     base: dict[Pairs, float] = {}
-    rivals: dict[Pairs, float] = {}
+    rivals: dict[Pairs, tuple[float, float]] = {}
     for pairs, placement in listed.items():
         if any(named.get(i, a) != a or owner.get(a, i) != i for i, a in pairs):
             continue
@@ -212,35 +238,37 @@ def _additions(
         if not new or 0 < len(old) < LEAST_POINTS:
             continue
         odds = k * float(np.log(FOUND)) - _log_ways(n, k)  # any k may be the body
+        usual = 0.0 if old else _log_usual(np.eye(3), placement.rotation)
         if not old:
             odds += _odds(placement, k, volume, m)
         else:
             if old not in base:
                 base[old] = fixed.log_likelihood if (fixed := place(before, points, old)) else np.inf
             odds += placement.log_likelihood - base[old] - k * float(np.log(m / volume)) - _log_ways(len(named), len(old))
-        rivals[new] = max(rivals.get(new, -np.inf), odds)
-    return _sorted([(odds, pairs) for pairs, odds in rivals.items()])
+        rivals[new] = max(rivals.get(new, (-np.inf, 0.0)), (odds, usual))
+    return [(odds, pairs, rivals[pairs][1]) for odds, pairs in _sorted([(odds, pairs) for pairs, (odds, _) in rivals.items()])]
 
 
 def _log_ways(n: int, k: int) -> float:
     return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
 
 
-def _summed(rivals: Sequence[tuple[float, Pairs]], m: int) -> tuple[dict[tuple[int, int], float], list[Pairs]]:
-    groups = [pairs for _, pairs in rivals]
-    packing = pack([(*(a for _, a in pairs), *(m + i for i, _ in pairs)) for pairs in groups], np.array([odds for odds, _ in rivals]))
-    return _names(groups, np.nan_to_num(packing.posterior)), [groups[g] for g in np.flatnonzero(packing.chosen)]
+def _summed(rivals: Sequence[tuple[float, Pairs, float]], m: int) -> tuple[dict[tuple[int, int], float], list[int]]:
+    groups = [pairs for _, pairs, _ in rivals]
+    claims = [(*(a for _, a in pairs), *(m + i for i, _ in pairs)) for pairs in groups]
+    chosen, chances = _packed(claims, [odds for odds, _, _ in rivals], [usual for _, _, usual in rivals])
+    return _names(groups, chances), np.flatnonzero(chosen).tolist()
 
 
 def _with_uncounted(
-    chances: Mapping[tuple[int, int], float], chosen: Mapping[Pairs, float], uncounted: Sequence[tuple[float, Pairs]]
+    chances: Mapping[tuple[int, int], float], chosen: Mapping[Pairs, float], uncounted: Sequence[tuple[float, Pairs, float]]
 ) -> dict[tuple[int, int], float]:
     """Return the chances of names, less by those rivals of the chosen bodies that were too many to be summed.
 
     A rival has the odds of its own against those of the markers and points that it takes away, as parts of their bodies.
     """
     against: dict[Pairs, list[float]] = {body: [-np.inf] for body in chosen}
-    for odds, rival in uncounted:
+    for odds, rival, _ in uncounted:
         markers, points = dict(rival), {a: i for i, a in rival}
         taken = {body: sum(i in markers or a in points for i, a in body) for body in chosen}
         gain = odds - sum(chosen[body] * count / len(body) for body, count in taken.items())
@@ -264,11 +292,12 @@ def _sorted(rivals: list[tuple[float, Pairs]]) -> list[tuple[float, Pairs]]:
 
 
 def _names(groups: Sequence[Pairs], chances: Float) -> dict[tuple[int, int], float]:
-    names: dict[tuple[int, int], float] = {}
-    for pairs, chance in zip(groups, chances.tolist(), strict=True):
+    """Return the least chance of each name, of chances of shape (2, g)."""
+    names: dict[tuple[int, int], Float] = {}
+    for pairs, both in zip(groups, chances.T, strict=True):
         for pair in pairs:
-            names[pair] = names.get(pair, 0.0) + chance
-    return names
+            names[pair] = names.get(pair, 0.0) + both
+    return {pair: float(both.min()) for pair, both in names.items()}
 
 
 def _known(segment: Cloud, points: Cloud, rigid: Pairs, loose: Pairs, names: dict[tuple[int, int], float], posterior: float) -> Known:
@@ -276,10 +305,10 @@ def _known(segment: Cloud, points: Cloud, rigid: Pairs, loose: Pairs, names: dic
     doubtful = tuple(pair for pair in rigid if names[pair] < posterior)
     placement = place(segment, points, pairs) if len(pairs) >= LEAST_POINTS else None
     if placement is None:
-        pairs, doubtful, loose = (), rigid, ()
+        pairs, doubtful, loose = (), tuple(sorted((*rigid, *loose))), ()
     moved = () if placement is None else tuple(p for p, sigma in zip(pairs, placement.sigmas, strict=True) if sigma > LOOSE_SIGMA)
     moved += tuple(pair for pair in loose if names[pair] >= posterior)
-    named = {i for i, _ in (*rigid, *moved)}
+    named = {i for i, _ in (*rigid, *doubtful, *moved)}
     return Known(pairs, doubtful, tuple(sorted(moved)), tuple(i for i in range(len(segment)) if i not in named), placement)
 
 

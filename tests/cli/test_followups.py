@@ -242,6 +242,26 @@ def test_films_of_another_subject_are_reviewed_and_no_others() -> None:
     assert not {row["marker"] for row in foreign["markers"] if row["x_mm"] is not None} & {row["marker"] for row in first["markers"]}
 
 
+@pytest.mark.parametrize(("first", "with_ray"), [(0, False), (1, False), (0, True)])
+def test_a_bone_of_three_that_a_loose_marker_turns_over_is_reviewed_and_has_no_motion(first: int, with_ray: bool) -> None:
+    """In a later examination as in the first, where the other segment tells how it should lie; 24 mm off with nothing said before."""
+    bone = np.array([[-12.0, 0, 0], [12, 0, 0], [0.25, 20, 0]])
+    stem = np.random.default_rng(6).normal(0, 15, (5, 3)) + np.array([0, 60, 0])
+    segments = {"S": [Segment("bone", tuple("123"), bone), Segment("stem", tuple("12345"), stem)]}
+    loose = bone + np.outer([0, 0, 1], [-0.5, 0, 0])
+    turn = Rotation.from_euler("xyz", [4, -3, 8], degrees=True)
+    exams = [rows_of("1", np.concatenate([bone, stem])), rows_of("2", turn.apply(np.concatenate([loose, stem])) + 2)]
+    if with_ray:  # another image of the third: it tells nothing more
+        image = dict.fromkeys(SCHEMAS["images"]) | {"focus": 1, "role": "unassigned", "number": "", "shape": "ball", "flags": ""}
+        ray = seen_from(np.random.default_rng(7), turn.apply(loose[2:]) + 2, np.array([0]))
+        exams[1] = {**exams[1], "images": [image], **Sightlines(ray, (), np.zeros(0)).rows()}
+    *whole, last = follow_up(exams[first:], segments, Limits())
+    assert all(rows["exams"][0]["status"] == "ok" for rows in whole)
+    assert last["exams"][0]["status"] == "review"
+    assert "constellation-ambiguous" in last["exams"][0]["reasons"]
+    assert [row["segment"] for row in last["markers"] if row["segment"] and row["x_mm"] is not None] == ["stem"] * 5
+
+
 def test_a_marker_that_only_some_of_its_group_would_name_is_loose() -> None:
     """Three of eight agreed with a moved marker of large errors; nothing was said of the others."""
     loose = 0

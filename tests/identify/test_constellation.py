@@ -132,6 +132,50 @@ def test_markers_that_have_not_moved_are_told_by_how_well_they_agree() -> None:
     assert named > 160, named
 
 
+def isosceles(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return three places that a half turn brings nearly onto themselves (0.1 to 0.5 mm), and where the third completes the half turn."""
+    difference = rng.uniform(0.2, 1.0)
+    bone = np.array([[-12.0, 0, 0], [12, 0, 0], [difference / 2, 20, 0]])
+    return bone, bone + np.outer([0, 0, 1], [-difference, 0, 0])
+
+
+@pytest.mark.parametrize("sd_mm", [0.004, 0.02])
+def test_of_three_markers_no_loose_one_turns_the_bone_over(sd_mm: float) -> None:
+    rng = np.random.default_rng(8)
+    known_again = 0
+    for _ in range(25):
+        bone, completed = isosceles(rng)
+        stem = random_body(rng, 5) + np.array([0, 60, 0])
+        before, moved = Rotation.random(random_state=rng), Rotation.from_rotvec(rng.normal(0, 0.2, 3))
+        bodies, turns = [Cloud.exact(bone), Cloud.exact(stem)], [before.as_matrix()] * 2
+        for shape in (bone, completed, bone + np.outer([0, 0, 1], [rng.uniform(-1, -0.3), *rng.normal(0, 0.15, 2)])):
+            places = np.concatenate([(moved * before).apply(shape), before.apply(stem)])
+            known, other = match_segments(bodies, measured(rng, places, sd_mm), POSTERIOR, turns)
+            assert [(i, a) for i, a in known.pairs if i != a] == []
+            assert known.pairs == () or shape is not completed
+            assert len(other.pairs) == 5
+            known_again += len(known.pairs) == 3
+    assert known_again >= 15  # most of the 25 that nothing is wrong with
+
+
+def test_a_rotation_seen_before_makes_no_name_sure_that_the_points_leave_open() -> None:
+    found = examination(np.random.default_rng(1), [TRIANGLE], 0.01, lost=0, loose=0, strays=0)
+    for turn in Rotation.create_group("O"):
+        (known,) = match_segments([Cloud.exact(TRIANGLE)], found.points, POSTERIOR, [turn.as_matrix()])
+        assert known.pairs == ()
+
+
+def test_a_body_that_is_turned_over_keeps_its_names() -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(20):
+        bone = np.array([[0, 0, 0], [30, 0, 0], [9, 9, 0]]) + rng.normal(0, 0.5, (3, 3))
+        bodies = [bone, random_body(rng, 4) + np.array([0, 60, 0])]
+        over = Rotation.from_rotvec(np.pi * Rotation.random(random_state=rng).as_matrix()[0])
+        points = measured(rng, over.apply(np.concatenate(bodies)), 0.005)
+        known, _ = match_segments([Cloud.exact(body) for body in bodies], points, POSTERIOR, [np.eye(3)] * 2)
+        assert known.pairs == ((0, 0), (1, 1), (2, 2))
+
+
 def test_a_wrong_constellation_is_not_recognised() -> None:
     rng = np.random.default_rng(4)
     recognised = 0

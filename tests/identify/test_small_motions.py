@@ -85,6 +85,17 @@ def test_a_loose_marker_does_not_make_the_others_of_its_bone_change_places() -> 
     assert named / cases > 0.9
 
 
+def test_a_loose_marker_of_three_does_not_turn_its_bone_over() -> None:
+    rng = np.random.default_rng(21)
+    for _ in range(40):
+        difference = rng.uniform(0.2, 1.0)
+        bone = np.array([[-12.0, 0, 0], [12, 0, 0], [difference / 2, 20, 0]])
+        completed = bone + np.outer([0, 0, 1], [-difference, 0, 0])  # fits the half turn
+        before, points, truth = follow_up(rng, bone, completed, (1.0, 4.0))
+        bodies, _ = match_bodies(before, points, POSTERIOR)
+        assert [(i, a) for body in bodies for i, a in body if truth[a] != i] == []
+
+
 @pytest.mark.parametrize(("off_mm", "named"), [(0.04, True), (0.16, False)])
 def test_three_points_left_over_have_names_only_if_they_fit_well(off_mm: float, named: bool) -> None:
     rng = np.random.default_rng(20)
