@@ -139,7 +139,7 @@ def measure(
     depends_on = {"settings": _described(settled), "geometry": about, "method": method}
     tasks = [Task(files, settled, geometry, depends_on, out, redo) for files in grouping.exams]
     outcomes = run(tasks, jobs, timeout_s, lambda outcome: watch(outcome, len(tasks)) if watch else None)
-    outcomes = with_copies_reviewed(grouping.exams, _turns_reviewed(_followed_up(outcomes, known, settled), geometry))
+    outcomes = with_copies_reviewed(grouping.exams, _compared(_followed_up(outcomes, known, settled), geometry, settled))
     write_tables(out, (outcome.rows for outcome in outcomes))
     write_motion(out, settled)
     options = {"method": method, "segments": _hashed(segments), "jobs": jobs, "redo": redo, "timeout_s": timeout_s}
@@ -218,7 +218,7 @@ def reconstruct(
         outcomes.append(Outcome(subject, exam, rows))
     if known is not None:  # names that somebody gave stand unless the segments are to give them
         outcomes = _followed_up(outcomes, known, settled)
-    outcomes = _turns_reviewed(outcomes, loaded)
+    outcomes = _compared(outcomes, loaded, settled)
     write_tables(out, (outcome.rows for outcome in outcomes))
     write_motion(out, settled)
     record = _record("reconstruct", started, points, study_file, settled, {"cage": cage_content(loaded)})
@@ -308,12 +308,15 @@ def _followed_up(outcomes: Sequence[Outcome], segments: Segments | None, study: 
     return [replace(outcome, rows=rows) for outcome, rows in zip(outcomes, every, strict=True)]
 
 
-def _turns_reviewed(outcomes: Sequence[Outcome], geometry: Cage | Mapping[int, Camera]) -> list[Outcome]:
+def _compared(outcomes: Sequence[Outcome], geometry: Cage | Mapping[int, Camera], study: Study) -> list[Outcome]:
+    """Have those examinations reviewed that others of their subject contradict."""
     from rsa_vision.cage_symmetry import turns
     from rsa_vision.cages import Cage
     from rsa_vision.turned import with_turned_reviewed
+    from rsa_vision.wrong_pairs import with_wrong_pairs_reviewed
 
-    every = with_turned_reviewed([outcome.rows for outcome in outcomes], turns(geometry) if isinstance(geometry, Cage) else ())
+    every = with_wrong_pairs_reviewed([outcome.rows for outcome in outcomes], study.limits)
+    every = with_turned_reviewed(every, turns(geometry) if isinstance(geometry, Cage) else ())
     return [replace(outcome, rows=rows) for outcome, rows in zip(outcomes, every, strict=True)]
 
 

@@ -75,7 +75,7 @@ REASONS: Final[dict[str, str]] = {
     "control-doubled": "most control points overlap other images, as those of a double focal spot do; look at the overlay",
     "focus-far": "the focus lies more than 150 mm from the nominal one; check the set-up in [foci]",
     "film-bend": "the mean y-parallax differs from zero: the film or cassette was not flat",
-    "pair-ambiguous": "another pairing of the object markers explains the rays nearly as well",
+    "pair-ambiguous": "another pairing of the object markers explains the rays nearly as well, or by later examinations better",
     "crossing-large": "rays of a marker miss each other by more than their statistics allow",
     "marker-one-view": "markers were seen from one focus only and have no coordinates",
     "marker-mismatch": "the markers found are not those of segments.csv, or of the earlier examinations",
