@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.find import STRENGTH, significance_limit
 from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.marks.found import marks_of
-from rsa_vision.detect.marks.polarity import first_looks, is_mottled, likelier, of_doubtful_polarity, polarities
+from rsa_vision.detect.marks.polarity import are_of_one_kind, first_looks, is_mottled, likelier, of_doubtful_polarity, polarities
 from rsa_vision.detect.marks.response import BITS, high_balls, in_film_values, is_straighter, log_odds
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.first_pins import MOST_STROKES, look_for_pins
@@ -94,8 +94,9 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, on
         if only not in (None, seen.sign):
             continue
         mottled = is_mottled(seeds, seen.sign, noise)
-        # where both show nearly as much, first looks do not say which is which
-        if found and found[0][0] > (0.0 if not seen.rival else np.inf if mottled else _BEYOND * seen.weight):
+        # where both show nearly as much, first looks do not say which is which; nor where there may be tees, and bubbles were found
+        enough = 0.0 if not seen.rival else np.inf if mottled else _BEYOND * seen.weight
+        if found and found[0][0] > enough and (not seen.junctions or are_of_one_kind(found[0][1].images)):
             break
         bright = high_balls(seen.looks, seen.noise)
         if len(bright.depth) and only is None:

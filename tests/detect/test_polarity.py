@@ -9,6 +9,8 @@ from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Float
 
 from .films import film_of_balls, stored
+from .test_covered import SIDE as TEES_SIDE
+from .test_covered import exposed, light_past_tees, tips_of
 
 SIDE, RADIUS_PX, LEVEL, NOISE = 600, 4.0, 20000.0, 400.0
 
@@ -50,3 +52,14 @@ def test_holes_of_a_plate_among_marks_are_no_marks_without_a_flag() -> None:
     found = detect_markers(stored(film), bits=16).images
     none = np.hypot(*(found.position_px[:, None] - places[:12]).transpose(2, 0, 1)).min(axis=1) > 2
     assert (found.flags[none] & MarkerFlag.UNLIKE).all()
+
+
+def test_tees_among_many_more_bubbles() -> None:
+    rng = np.random.default_rng(6)
+    tips, places = tips_of(rng), rng.uniform(10, TEES_SIDE - 10, (2000, 2))
+    places = places[np.hypot(*(places[:, None] - tips).transpose(2, 0, 1)).min(axis=1) > 40]
+    places = places[[all(np.hypot(*(places[:k] - at).T) > 24) for k, at in enumerate(places)]]
+    film = exposed(light_past_tees(tips, np.ones(len(tips))) * (1 + bubbles(places, rng.uniform(4.0, 8.0, len(places)), 0.05)), rng)
+    found = detect_markers(film, bits=16).images
+    assert found.shape.tolist() == ["tee"] * len(tips)
+    assert np.hypot(*(found.position_px[:, None] - tips).transpose(2, 0, 1)).min(axis=0).max() < 0.3

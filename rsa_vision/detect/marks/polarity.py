@@ -25,6 +25,7 @@ from rsa_vision.detect.needles.pointed import is_slim
 from rsa_vision.detect.needles.tees import GUESS, first_tees, optics_of_tees
 from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.search.candidates import Candidates
+from rsa_vision.detect.search.junctions import ALONE
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
@@ -39,6 +40,7 @@ _CONTESTED = 0.4, 0.15  # of the evidence for a polarity, from which the other m
 _ONE_SIZE, _BY_CHANCE = 0.08, 0.01  # logarithms of the radii of balls of one kind; that as many are alike by chance
 _MOTTLE = 0.1  # part of the evidence of a polarity that the other has as well: of marks it has next to none
 _REACH = 3.0  # of the radius of the ring on which a junction's arms are seen, that these reach
+_A_SET = 5  # junctions
 _OF_A_TEE = 4.0  # evidence that the thick ends of a tee's arms may feign
 
 
@@ -59,6 +61,8 @@ class Seen:
         Evidence for it.
     rival : bool
         It is looked at even if the other sign has shown marks.
+    junctions : bool
+        Where three arms meet there are enough for a set of tees.
     """
 
     sign: int
@@ -67,6 +71,7 @@ class Seen:
     noise: NoiseModel
     weight: float
     rival: bool = True
+    junctions: bool = False
 
 
 def first_looks(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> tuple[BallFits, list[int]]:
@@ -219,7 +224,8 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
             needles = evidence
             if needles > 0 or not len(looks.depth):  # else even one faint ball knows more of its blur than nobody
                 optics = of_pins
-    return Seen(sign, looks, optics, under, balls + needles + _of_tees(candidates, sign))
+    meet = np.count_nonzero(np.abs(junctions[:, 4]) > ALONE) >= _A_SET
+    return Seen(sign, looks, optics, under, balls + needles + _of_tees(candidates, sign), junctions=bool(meet))
 
 
 def likelier(found: list[MarkerImages], evidence: list[float]) -> tuple[int, bool]:
@@ -238,14 +244,24 @@ def likelier(found: list[MarkerImages], evidence: list[float]) -> tuple[int, boo
     contested : bool
         The other shows marks as well.
     """
-    of_one_kind = [_are_of_one_kind(images) for images in found]
+    of_one_kind = [are_of_one_kind(images) for images in found]
     which, *others = sorted(range(len(found)), key=lambda k: (of_one_kind[k], evidence[k]), reverse=True)
     least = _CONTESTED[of_one_kind[which]] * evidence[which]
     return which, any(evidence[k] > least and of_one_kind[k] == of_one_kind[which] for k in others)
 
 
-def _are_of_one_kind(images: MarkerImages) -> bool:
-    """Say whether there are tees, or more balls of one size than chance makes of sizes that lie anywhere within a factor of two."""
+def are_of_one_kind(images: MarkerImages) -> bool:
+    """Say whether there are tees, or more balls of one size than chance makes of sizes that lie anywhere within a factor of two.
+
+    Parameters
+    ----------
+    images : MarkerImages
+        Of one polarity.
+
+    Returns
+    -------
+    bool
+    """
     sure = images.rows(images.flags & ~(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SATURATED) == 0)
     if np.count_nonzero(sure.shape == "tee") >= LEAST_KNOWN:
         return True
