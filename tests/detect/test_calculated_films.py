@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.film.noise import saturation
+from rsa_vision.detect.film.saturation import saturation
 
 from .films import film_of_balls, grid_of_balls, stored
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsa_vision.detect.balls.find import CHANCE, EXPLAINED, MISFIT, SURE, misfit
+from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, EXPLAINED, MISFIT, SURE, misfit, plausible
 from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit
@@ -24,6 +24,7 @@ LEAST_KNOWN = 3  # balls that tell what one of them is like on this film
 _COMPANY = 6  # sure ones of one size that stand for each other where none is clear enough for a pattern
 _LIKE = 1.25  # images whose spreads are within this factor are of one size
 _SMALLER, _LARGER = 0.7, 1.45  # range of sizes around those of the sure ones: marks of one film are of few sizes
+_OF_CLEAR = 1.25  # ratio to the radius of any clear ball, where that is asked for
 _FAR = 1.5  # beyond that range, and twice the misfit that a ball may leave: no better fit comes back from there
 
 
@@ -36,6 +37,26 @@ def over_clutter(fits: BallFits) -> Float:
 def look_clear(fits: BallFits, noise: NoiseModel) -> Bool:
     """Say which first fits show what balls of the film are like; hardly anything but balls is among them."""
     return np.asarray((over_clutter(fits) > SURE) & (misfit(fits, noise) < MISFIT) & (fits.explained > CLOSE))
+
+
+def like_clear(fits: BallFits, known: BallFits, limit: float, noise: NoiseModel) -> Bool:
+    """Say which are of the size of a clear ball among those known, sure, and described well: for places where much else may pass for one.
+
+    Parameters
+    ----------
+    fits, known : BallFits
+    limit : float
+        Significance that noise alone would exceed too often.
+    noise : NoiseModel
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    clear = known.radius_px[look_clear(known, noise)]
+    size = np.abs(np.log(fits.radius_px[:, None] / clear)).min(axis=1, initial=np.inf) < np.log(_OF_CLEAR)
+    close = plausible(fits, noise) & (misfit(fits, noise) < DOUBTFUL * MISFIT)
+    return np.asarray(size & close & (over_clutter(fits) > max(SURE, limit)))
 
 
 def hopeless(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Bool:

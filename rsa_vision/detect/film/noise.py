@@ -13,6 +13,7 @@ from scipy.special import chdtri
 
 from rsa_vision.detect.film.compression import noise_of_compression
 from rsa_vision.detect.film.repairs import repaired_lines
+from rsa_vision.detect.film.saturation import saturation
 from rsa_vision.detect.film.tiles import ENOUGH_TILES, NO_NOISE, QUANTISATION, roughness, skewness, tiles_of, whole_tiles, without_surfaces
 from rsa_vision.types import Bool, Float, Int
 
@@ -24,10 +25,6 @@ _CROWDED, _ONE_SIDED = 3.0, 0.5  # roughness and skewness of a film's tiles from
 _EVEN = 0.6  # roughness of the quietest of these up to which they tell
 _STRUCTURE = 8.0  # times as much variance as film of its fine noise has elsewhere: tiles of such a class lie on edges
 LAGS = 5  # correlation is followed to this distance in pixels
-_MOST_LOOKED_AT = 1500**2  # pixels that tell whether a film is saturated
-_MUCH, _SPECKS = 0.2, 0.2  # part of a film that its background is, part of the runs of pixels in it that are one pixel long
-_ENOUGH, _FADES = 30, 2.0  # pixels within a distance of its value, and how many times as many as there are within the fourth of such
-_TAIL = 16  # such distances are less than this part of the values
 _LEVELS = 12  # value classes of the variance curve
 _MORE_AT_ENDS, _APART = 4, 0.5  # classes more, of tiles that differ by so many standard deviations of the noise
 _AS_FINE = 1.3  # of the roughness of the others
@@ -159,51 +156,6 @@ class NoiseModel:
         return float(np.sqrt(np.median(self.variance)))
 
 
-def saturation(film: NDArray[Any], bits: int) -> tuple[float, float]:
-    """Return the values at and beyond which pixels are saturated.
-
-    A limit of the value range counts as saturation only where a crowd of pixels piles up on it: more than on the values beside it. So do
-    the pixels of the background of a film without noise. What is cut off goes on beside it as steeply as before; into such a background the
-    images of marks fade out: the nearer to it, the more pixels have a value.
-
-    Parameters
-    ----------
-    film : ndarray of shape (rows, cols)
-    bits : int
-        Significant bits.
-
-    Returns
-    -------
-    floor, ceiling : float
-        Pixels must lie strictly between; infinite where nothing is saturated.
-    """
-    sample = film[:: max(1, film.size // _MOST_LOOKED_AT)]  # whole rows, as they lie in memory
-    low, high = int(sample.min()), int(sample.max())
-    floor = float(low) if _is_saturated(sample, low, 1, low == 0) else -np.inf
-    ceiling = float(high) if _is_saturated(sample, high, -1, high >= 2**bits - 1) else np.inf
-    return floor, ceiling
-
-
-def _is_saturated(sample: NDArray[Any], edge: int, inward: int, limit: bool) -> bool:
-    there = sample == edge
-    count = int(np.count_nonzero(there))
-    if count <= max(20, sample.size // 20000):
-        return False
-    if not limit and count <= 5 * max(1, *(int(np.count_nonzero(sample == edge + inward * k)) for k in range(1, 6))):
-        return False
-    # noise makes specks in areas of one value; of a tail there are as many pixels at a distance as are inverse to it
-    specks = np.count_nonzero(there[:, :-2] & ~there[:, 1:-1] & there[:, 2:])
-    if count < _MUCH * sample.size or specks > _SPECKS * np.count_nonzero(there[:, :-1] & ~there[:, 1:]):
-        return True
-    distance = np.sort((sample[~there].astype(np.int64) - edge) * inward)
-    if len(distance) == 0:
-        return True
-    reach = 2 ** np.arange(max(1, int(np.log2(distance[-1] / _TAIL)) + 1))
-    near, third, far = (np.searchsorted(distance, k * reach, side="right") for k in (1, 3, 4))
-    counted = near >= _ENOUGH
-    return bool(not counted.any() or (near < _FADES * (far - third))[counted].any())
-
-
 def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     """Estimate the noise of a film from tiles spread over it.
 
@@ -253,11 +205,11 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     for part in np.array_split(order, max(1, min(_LEVELS, len(order) // 16))):
         add(part)
     # the quietest of the last class may be far from the end of the values, and marks lie where the film is still darker
-    fine = roughness(tiles, variance) < _AS_FINE * float(np.median(rough))
+    no_edges = roughness(tiles, variance) < _AS_FINE * float(np.median(rough))
     for sign in (-1, 1):
         for _ in range(_MORE_AT_ENDS):
             end = int(np.argmax(sign * np.array(level)))
-            beyond = np.flatnonzero(fine & (sign * (mean - level[end]) > _APART * np.sqrt(curve[end])))
+            beyond = np.flatnonzero(no_edges & (sign * (mean - level[end]) > _APART * np.sqrt(curve[end])))
             if len(beyond) < ENOUGH_TILES:
                 break
             add(beyond)
@@ -274,8 +226,8 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     bias = chdtri(independent, 0.875) / independent / (1 + hidden)  # the median of the quietest quarter is the eighth of all
     # a film without noise is one that was calculated: no more exact than that
     least = (_CALCULATED * float(np.ptp(tiles))) ** 2 if curve_array.min() < NO_NOISE else 0.0
-    if np.count_nonzero(fine) >= ENOUGH_TILES:
-        level_array, curve_array = _to_the_ends(level_array, curve_array, np.quantile(mean[fine], _ENDS))
+    if np.count_nonzero(no_edges) >= ENOUGH_TILES:
+        level_array, curve_array = _to_the_ends(level_array, curve_array, np.quantile(mean[no_edges], _ENDS))
     variance = np.maximum(curve_array / bias, max(QUANTISATION, least))
     lossy, pattern = noise_of_compression(film, LAGS, floor, ceiling), 0.0
     if lossy is not None:  # where it left nothing to see there is no noise either

@@ -74,19 +74,19 @@ def part(
         total: Float = beside(cols, rows) + shown(cols, rows)
         return total
 
-    def fitted(at_px: Float, size: float) -> tuple[BallFits, Background]:
+    def fitted(at_px: Float, size: float) -> tuple[BallFits, Float, Background]:
         return fit_one_over(film, at_px, size, without_tee, optics, noise, arms)
 
-    def sought() -> tuple[BallFits, Background]:
+    def sought() -> tuple[BallFits, Float, Background]:
         return fitted(_brightest_rest(film, tee, np.sign(depth), without_tee) if start_px is None else start_px, radius)
 
     arms = paint([(tee, tee_optics)])
-    ball, shown = sought()
+    ball, doubt, shown = sought()
     for step in range(_ROUNDS):
         tee = fit_crossing(film, [tee], tee_optics, noise, others=without_ball, steps=6)[0]
         arms = paint([(tee, tee_optics)])
         # what a ball has bent is no good guide to it
-        ball, shown = sought() if step < _SOUGHT else fitted(ball.position_px[0], float(ball.radius_px[0]))
+        ball, doubt, shown = sought() if step < _SOUGHT else fitted(ball.position_px[0], float(ball.radius_px[0]))
         if step == _SOUGHT and not (abs(np.log(ball.radius_px[0] / radius)) < np.log(_ROUGHLY) and ball.depth[0] / depth > 1 / _ROUGHLY):
             return None
     alike = abs(np.log(ball.radius_px[0] / radius)) < 0.25 and 0.4 < ball.depth[0] / depth < 2.5
@@ -94,7 +94,9 @@ def part(
         return None
     of_tee, of_ball = _joint_covariance(film, tee, ball, optics, tee_optics, noise)
     excess = max(1.0, tee.chi2_core, float(ball.chi2_core[0]))
-    return replace(tee, covariance_px2=excess * of_tee), replace(ball, covariance=excess * of_ball[None])
+    of_ball = excess * of_ball
+    of_ball[:2, :2] += doubt
+    return replace(tee, covariance_px2=excess * of_tee), replace(ball, covariance=of_ball[None])
 
 
 def _joint_covariance(

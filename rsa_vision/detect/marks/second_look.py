@@ -13,16 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import LEAST_KNOWN, look_clear, over_clutter
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, like_clear, look_clear, over_clutter
 from rsa_vision.detect.balls.find import (
-    DOUBTFUL,
-    MISFIT,
     STRENGTH,
     SURE,
     distinct,
     fit_at,
     in_correlated_noise,
-    misfit,
     no_fits,
     plausible,
     promising,
@@ -45,7 +42,6 @@ _ROUND = 0.4  # the filter that suits the usual size answers balls of it by roun
 _SIZE = 1.6  # ratio of the fitted radius to the usual one
 _ROUGH = 4.0  # times the misfit that is tolerated otherwise, before rims are fitted too or scratches masked
 _DEEP = 0.4  # of the depth of clear balls: half of one is seen against what is beside the rim; threads of screws are shallower
-_OF_SIZE = 1.25  # the same to that of any clear ball, where lines and scratches are what is seen first
 
 
 def look_again(
@@ -118,11 +114,8 @@ class _Look:
         return inside(fits, self.film) & ~_near(fits.position_px, known, self.usual)
 
     def sure(self, fits: BallFits, known: BallFits) -> Bool:
-        """Say which are of the sizes of clear balls, sure, and well described."""
-        clear = known.radius_px[look_clear(known, self.noise)]
-        size = np.abs(np.log(fits.radius_px[:, None] / clear)).min(axis=1, initial=np.inf) < np.log(_OF_SIZE)
-        close = plausible(fits, self.noise) & (misfit(fits, self.noise) < DOUBTFUL * MISFIT)
-        return np.asarray(size & close & (over_clutter(fits) > max(SURE, self.limit)))
+        """Say which are as :func:`like_clear`."""
+        return like_clear(fits, known, self.limit, self.noise)
 
 
 def _of_the_usual_size(look: _Look, place: Float, balls: BallFits) -> tuple[BallFits, Bool, BallFits]:

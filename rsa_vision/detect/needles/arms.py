@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.models.needles import NeedleFit
-from rsa_vision.detect.needles.sets import LEAST_ALIKE
+from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.types import Bool, Float
 
 _FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these may be what is seen of a tee; radians
@@ -88,4 +88,4 @@ def lone_tees(needles: list[NeedleFit], sure: Bool) -> Bool:
     parallel = np.abs(np.angle(np.exp(1j * (angle[:, None] - angle)))) < _PARALLEL
     alike = parallel & (np.abs(width[:, None] - width) < _AS_WIDE) & tee & sure
     alike[np.diag_indices(len(tee))] = True
-    return np.asarray(tee & (alike.sum(axis=1) < LEAST_ALIKE))
+    return np.asarray(tee & (alike.sum(axis=1) < LEAST_OF_A_KIND))

@@ -14,11 +14,11 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import Images, NeedleFit, needle_image
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import fit_crossing
+from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.types import Bool, Float
 
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
 MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
-LEAST_ALIKE = 3  # needles that tell what one of them is like
 NEAREST_PX = 3.0  # two tips nearer than this are one
 _BESIDE_PX = 10.0  # from the ends of arms, a little longer than they are, within which others are beside them
 
@@ -93,7 +93,7 @@ def is_located(needle: NeedleFit) -> bool:
 
 def as_usual(tee: NeedleFit, others: list[NeedleFit]) -> NeedleFit:
     """Return a tee of the usual size of others, its arms meeting at the usual angles: something on one of them turns and stretches it."""
-    if len(others) < LEAST_ALIKE:
+    if len(others) < LEAST_OF_A_KIND:
         return tee
     usual = np.median([_turn(t.angles - t.angles[0]) for t in others], axis=0)
     first = tee.angles[0] + np.median(_turn(tee.angles - tee.angles[0] - usual))

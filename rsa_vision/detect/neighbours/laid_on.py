@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import LEAST_KNOWN, look_clear, over_clutter
-from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, SURE, distinct, misfit, no_fits, plausible
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, like_clear, look_clear
+from rsa_vision.detect.balls.find import distinct, no_fits
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import weighted_least_squares
@@ -25,7 +25,7 @@ from rsa_vision.types import Bool, Float
 
 Draw = Callable[[GroupWindow, Float, Float, Float], GroupImages]
 OVER = 0.1  # of the depth of a ball, from which a needle lies over it
-_OF_SIZE, _DEEP = 1.25, 0.4  # ratio to the radius of clear balls; least depth, in parts of theirs
+_DEEP = 0.4  # least depth, in parts of that of clear balls
 _STAYS = 1.0  # of the radius, within which a fit comes out
 _APART = 0.5  # of the radius, between two places from which a fit begins
 
@@ -66,14 +66,16 @@ def fit_over(
     fits = [no_fits()]
     for at, radius in zip(start_px, start_radius_px, strict=True):
         itself = np.flatnonzero(np.hypot(*(known.position_px - at).T) < radius)
-        fits.append(fit_one_over(film, at, float(radius), all_but(known, itself, optics, painted), optics, noise, painted)[0])
+        ball, doubt, _ = fit_one_over(film, at, float(radius), all_but(known, itself, optics, painted), optics, noise, painted)
+        ball.covariance[:, :2, :2] += doubt
+        fits.append(ball)
     return join(fits)
 
 
 def fit_one_over(
     film: NDArray[Any], at_px: Float, radius_px: float, others: Background, optics: Optics, noise: NoiseModel, painted: Painted
-) -> tuple[BallFits, Background]:
-    """Fit one ball on needles; by how far two models of what it takes away of them differ is an error of its centre.
+) -> tuple[BallFits, Float, Background]:
+    """Fit one ball on needles.
 
     Parameters
     ----------
@@ -93,6 +95,8 @@ def fit_one_over(
     -------
     ball : BallFits
         One row.
+    doubt : ndarray of shape (2, 2)
+        Covariance of its centre by how far two models of what it takes away of them differ, px^2.
     shown : callable
         What it adds to the needles at pixels (cols, rows), in film values.
     """
@@ -102,8 +106,7 @@ def fit_one_over(
         for draw in (_linear(painted, optics), _additive(painted, optics))
     ]
     (draw, ball), (_, other) = sorted(tried, key=lambda one: float(one[1].chi2_core[0]))
-    apart = ball.position_px - other.position_px
-    ball.covariance[:, :2, :2] += OF_SHIFT * apart[:, :, None] * apart[:, None]
+    apart = (ball.position_px - other.position_px)[0]
     window = window_around(film, ball.position_px, ball.radius_px, sigma, noise, others)
     linear = draw(window, window.surface, ball.position_px - window.corner_px, ball.radius_px).linear
     theta = weighted_least_squares(linear, window.valid / noise.variance_at(window.raw), window.raw - window.neighbours)
@@ -114,7 +117,7 @@ def fit_one_over(
         inside = (np.minimum(col, row) >= 0) & (np.maximum(col, row) < window.size)
         return np.where(inside, picture[row.clip(0, window.size - 1), col.clip(0, window.size - 1)], 0.0)
 
-    return ball, shown
+    return ball, OF_SHIFT * np.outer(apart, apart), shown
 
 
 def _linear(painted: Painted, optics: Optics) -> Draw:
@@ -176,12 +179,10 @@ def look_on_arms(
     place = place[(np.hypot(*(place[:, None] - known.position_px).transpose(2, 0, 1)) > usual).all(axis=1)]
     starts = _apart(place, _APART * usual)
     balls = fit_over(film, starts, np.full(len(starts), usual), known, optics, noise, painted)
-    size = np.abs(np.log(balls.radius_px[:, None] / clear.radius_px)).min(axis=1, initial=np.inf) < np.log(_OF_SIZE)
-    close = plausible(balls, noise) & (misfit(balls, noise) < DOUBTFUL * MISFIT)
     deep = np.sign(np.median(clear.depth)) * balls.depth > _DEEP * depth
     stays = np.hypot(*(balls.position_px - starts).T) < _STAYS * usual
     free = (np.hypot(*(balls.position_px[:, None] - known.position_px).transpose(2, 0, 1)) > usual).all(axis=1)
-    return distinct(balls.rows(size & close & deep & stays & free & (over_clutter(balls) > max(SURE, limit))), noise)
+    return distinct(balls.rows(like_clear(balls, known, limit, noise) & deep & stays & free), noise)
 
 
 def _apart(place: Float, gap_px: float) -> Float:
