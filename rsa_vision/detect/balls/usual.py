@@ -14,6 +14,7 @@ _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
 _LEAST_BENT, _NEAREST = 10, 6  # those whose depths tell it at their own background, and how many do for each
 _BENT = 0.5  # of what a straight line leaves of depths, that is left by those at nearly the same background
+_SLOPING = 0.7  # of how those differ, that lines through them leave: balls of several kinds have depths apart, and no slope
 _UNSEEN = 2.0  # times the slope that they tell: the film shows less of how the light changes beside them as well
 _LEAST_VALUE = 1.0  # of a film
 _OUTLIER = 3.0
@@ -158,25 +159,26 @@ def proportion(depth: Float, background: Float, beside: Float, at: Float) -> Pro
         return Proportion(np.full(len(at), slope), np.full(len(at), sd))
     gap = np.abs(background[:, None] - background)
     others = np.argsort(gap + np.diag(np.full(len(gap), np.inf)), axis=1)[:, :_NEAREST]
-    line, near = _lines(depth[None], background[None], background)[0], _lines(depth[others], background[others], background)[0]
+    line, (near, _, _, rest) = _lines(depth[None], background[None], background)[0], _lines(depth[others], background[others], background)
     left, by_line, at_all = (float(np.median(np.abs(depth - of))) for of in (near, line, np.median(depth)))
-    if left > _BENT * min(by_line, at_all):  # a few of another kind turn a line, and none
+    sloping = np.median(rest / np.maximum(depth[others].std(axis=1, ddof=1), 1e-12)) < _SLOPING
+    if left > _BENT * min(by_line, at_all) or not sloping:  # a few of another kind turn a line, and none
         return Proportion(np.full(len(at), slope), np.full(len(at), sd))
     order = np.argsort(np.abs(at[:, None] - background), axis=1)
-    (_, local, error), (_, wider, _) = (
+    (_, local, error, _), (_, wider, _, _) = (
         _lines(depth[order[:, :count]], background[order[:, :count]], at) for count in (_NEAREST, 2 * _NEAREST)
     )
     return Proportion(local, np.sqrt(error**2 + (0.5 * (local - wider)) ** 2 + (_UNSEEN * local) ** 2))
 
 
-def _lines(depth: Float, background: Float, at: Float) -> tuple[Float, Float, Float]:
-    """Return what straight lines through depths (n, k) come to at backgrounds (n,), their slopes, and the errors of these."""
+def _lines(depth: Float, background: Float, at: Float) -> tuple[Float, Float, Float, Float]:
+    """Return what straight lines through depths (n, k) come to at backgrounds (n,), their slopes, the errors of these, and what is left."""
     off = background - background.mean(axis=1, keepdims=True)
     square = np.maximum((off**2).sum(axis=1), 1e-12)
     slope = (off * depth).sum(axis=1) / square
-    left = depth - depth.mean(axis=1, keepdims=True) - slope[:, None] * off
-    error = np.sqrt((left**2).sum(axis=1) / (depth.shape[1] - 2) / square)
-    return depth.mean(axis=1) + slope * (at - background.mean(axis=1)), slope, error
+    off_line = depth - depth.mean(axis=1, keepdims=True) - slope[:, None] * off
+    left = np.sqrt((off_line**2).sum(axis=1) / (depth.shape[1] - 2))
+    return depth.mean(axis=1) + slope * (at - background.mean(axis=1)), slope, left / np.sqrt(square), left
 
 
 def proportion_of_all(depth: Float, background: Float, beside: Float) -> tuple[float, float]:
