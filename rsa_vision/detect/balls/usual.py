@@ -13,8 +13,8 @@ from rsa_vision.types import Float, Int
 _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
 _LEAST_BENT, _NEAREST = 10, 6  # those whose depths tell it at their own background, and how many do for each
-_BENT = 0.5  # of what a straight line leaves of depths, that is left by those at nearly the same background
-_SLOPING = 0.7  # of how those differ, that lines through them leave: balls of several kinds have depths apart, and no slope
+_BENT = 0.7  # of what a straight line leaves of depths, that is left by those at nearly the same background
+_SLOPING = 0.5  # of how those differ, that lines through most or through all leave: balls of several kinds have depths apart, and no slope
 _UNSEEN = 2.0  # times the slope that they tell: the film shows less of how the light changes beside them as well
 _LEAST_VALUE = 1.0  # of a film
 _OUTLIER = 3.0
@@ -161,7 +161,8 @@ def proportion(depth: Float, background: Float, beside: Float, at: Float) -> Pro
     others = np.argsort(gap + np.diag(np.full(len(gap), np.inf)), axis=1)[:, :_NEAREST]
     line, (near, _, _, rest) = _lines(depth[None], background[None], background)[0], _lines(depth[others], background[others], background)
     left, by_line, at_all = (float(np.median(np.abs(depth - of))) for of in (near, line, np.median(depth)))
-    sloping = np.median(rest / np.maximum(depth[others].std(axis=1, ddof=1), 1e-12)) < _SLOPING
+    differ = np.maximum(depth[others].std(axis=1, ddof=1), 1e-12)
+    sloping = min(float(np.median(rest / differ)), float(np.sqrt((rest @ rest) / (differ @ differ)))) < _SLOPING
     if left > _BENT * min(by_line, at_all) or not sloping:  # a few of another kind turn a line, and none
         return Proportion(np.full(len(at), slope), np.full(len(at), sd))
     order = np.argsort(np.abs(at[:, None] - background), axis=1)
