@@ -48,7 +48,7 @@ def test_dots_are_no_more_evidence_for_balls_in_a_wide_blur_than_they_are_high()
     fits = fit_at(values, truth, radius, optics, noise)
     plain = np.zeros(len(truth), bool)
     images, evidence = table_of(
-        values, 16, fits, 1.0, np.ones(len(truth)), np.zeros(len(truth)), plain, plain, plain, [], np.zeros((0, 5)), optics, noise
+        values, 16, fits, 1.0, np.ones(len(truth)), np.zeros((len(truth), 2, 2)), plain, plain, plain, [], np.zeros((0, 5)), optics, noise
     )
     assert np.median(images.snr) > 3 * high
     assert 0.5 * high * len(truth) < evidence < 2 * high * len(truth)

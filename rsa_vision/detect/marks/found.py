@@ -23,6 +23,7 @@ from rsa_vision.detect.marks.resolve import Balls, resolve_balls
 from rsa_vision.detect.marks.second_look import look_again
 from rsa_vision.detect.marks.settle import STRUCTURE, settle
 from rsa_vision.detect.marks.table import NEEDLES_ALIKE, WHOLE, table_of, what_is_left
+from rsa_vision.detect.marks.unsteady import Marks, by_lines, unsteady_lines
 from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
@@ -268,6 +269,8 @@ def _measured(
     bent, under_one_curve = under_curve(film, known, found.edged, clear, _undisturbed(found, optics), optics, noise, painted)
     found = replace(found, fits=bent, edged=found.edged & ~under_one_curve)
     balls, ratio, by_size, covered = settle(film, found, around.places, under, free, beside, optics, noise)
+    balls, added = _by_lines(Marks(film, balls, others, painted, optics, noise), clear, around.places, under)
+    added[: len(by_size)] += by_size[:, None, None] * np.eye(2)
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
         touching = touching | over_arms(balls, painted)
     left, poor = what_is_left(balls, under, optics.sigma_px, noise)
@@ -277,10 +280,19 @@ def _measured(
     keep &= ~(poor & ends)
     poor |= are_oblong(film, balls, beside, optics, noise)
     touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
-    balls, ratio, by_size, touching, poor = balls.rows(keep), ratio[keep], by_size[keep], touching[keep], poor[keep]
+    balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
+    added = added[np.append(keep, np.ones(len(others), bool))]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
     doubtful = lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
-    return table_of(film, bits, balls, under, ratio, by_size, touching, poor, doubtful, others, faint.junctions, optics, noise)
+    return table_of(film, bits, balls, under, ratio, added, touching, poor, doubtful, others, faint.junctions, optics, noise)
+
+
+def _by_lines(marks: Marks, clear: Int, places: list[Places], under: float) -> tuple[BallFits, Float]:
+    """Balls, and what displaced lines add to the covariances of them and of the needles; what these left under balls is no noise."""
+    lines = unsteady_lines(marks, clear, places)
+    if lines is None:
+        return marks.balls, np.zeros((len(marks.balls.depth) + len(marks.needles), 2, 2))
+    return replace(marks.balls, covariance=min(lines.noise / under, 1.0) * marks.balls.covariance), by_lines(lines, marks)
 
 
 def _undisturbed(found: Balls, optics: Optics) -> list[Int]:

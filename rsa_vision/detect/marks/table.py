@@ -56,7 +56,7 @@ def table_of(
     balls: BallFits,
     usual: float,
     ratio: Float,
-    by_size: Float,
+    added: Float,
     touching: Bool,
     poor_ball: Bool,
     doubtful: Bool,
@@ -76,8 +76,8 @@ def table_of(
         Variance of the noise under balls, in units of that beside them.
     ratio : ndarray of shape (n,)
         Squared errors by their surroundings, as :func:`rsa_vision.detect.marks.settle.settle` tells.
-    by_size : ndarray of shape (n,)
-        Variances of balls of a size of their own, px^2, as of the same: no noise multiplies them.
+    added : ndarray of shape (n + m, 2, 2)
+        Covariances of balls and tees, px^2, that no noise multiplies.
     touching, poor_ball, doubtful : ndarray of bool, shape (n,)
         Balls with something as dense beside them; that the model does not describe; that may belong to the texture of the film.
     tees : list of NeedleFit
@@ -103,10 +103,11 @@ def table_of(
     excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0)) * ratio
     covariance = np.concatenate(
         [
-            balls.covariance[:, :2, :2] * excess[:, None, None] + by_size[:, None, None] * np.eye(2),
+            balls.covariance[:, :2, :2] * excess[:, None, None],
             np.array([t.covariance_px2 * excess_of(t, noise) for t in tees]).reshape(-1, 2, 2),
         ]
     )
+    covariance += added
     radius = np.concatenate([balls.radius_px, [t.shape.half_width_px for t in tees]])
     depth = np.abs(np.concatenate([balls.depth, [t.depth for t in tees]]))
     background = np.concatenate([balls.background, [t.background for t in tees]])
