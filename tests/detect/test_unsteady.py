@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
 
-from .films import film_of_balls, grid_of_balls, misses, stored
+from .films import film_of_balls, grid_of_balls, stored
 
 SIDE = 600
 
