@@ -11,7 +11,6 @@ import numpy as np
 from rsa_vision.flags import MarkerFlag, flag_names, flag_value
 from rsa_vision.identify.contested import settle
 from rsa_vision.identify.poses import Cloud
-from rsa_vision.segments import Segment
 from rsa_vision.settings import Limits
 from rsa_vision.sightlines import Sightlines
 from rsa_vision.tables import AXES, SCHEMAS, Row, Rows, marker_rows, name_of, plain
@@ -33,14 +32,15 @@ def cloud_of(markers: Sequence[Row]) -> Cloud:
     return Cloud(position, covariance)
 
 
-def settle_pairs(rows: Rows, segments: Sequence[Segment], limits: Limits) -> Rows:
+def settle_pairs(rows: Rows, bodies: Sequence[Cloud], limits: Limits) -> Rows:
     """Decide doubtful pairs by known segments.
 
     Parameters
     ----------
     rows : dict
         Tables of one examination, with what its films leave open (:class:`rsa_vision.sightlines.Sightlines`).
-    segments : sequence of Segment
+    bodies : sequence of Cloud
+        The known segments.
     limits : Limits
         ``posterior`` and ``crossing_sigma`` are used.
 
@@ -61,7 +61,7 @@ def settle_pairs(rows: Rows, segments: Sequence[Segment], limits: Limits) -> Row
     markers, _, _ = _intersected(rows, contest, range(len(seen_by)), limits)
     here = np.flatnonzero(np.isfinite(markers.position_mm).all(axis=1))
     chances = settle(
-        [Cloud.exact(segment.position_mm) for segment in segments],
+        bodies,
         cloud_of([row for row in rows["markers"] if row["x_mm"] is not None and name_of(row) not in names]),
         Cloud(markers.position_mm[here], markers.covariance_mm2[here]),
         [seen_by[c] for c in here],

@@ -17,6 +17,7 @@ from rsa_vision.flags import MarkerFlag, flag_names, flag_value
 from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.constellation import LOOSE_SIGMA, Known, match_bodies, match_segments
 from rsa_vision.identify.hidden import Sighting
+from rsa_vision.identify.known_bodies import Seen, as_measured
 from rsa_vision.identify.poses import Cloud, Pairs, place
 from rsa_vision.ordering import natural_key
 from rsa_vision.segments import Segment, Segments, segments_of
@@ -27,6 +28,7 @@ from rsa_vision.types import Float
 from rsa_vision.verdict import Finding, conclude
 
 UNRELATED: Final = 8  # markers of which not one is found again, nor nearly: another object, not one whose few markers moved
+UNSURE: Final = MarkerFlag.AMBIGUOUS | MarkerFlag.LOOSE | MarkerFlag.LARGE_RESIDUAL  # places that nothing is compared with later
 MOST_EARLIER: Final = 6  # examinations that one is compared with: the first, and the last ones before it
 
 
@@ -44,6 +46,7 @@ class _Exam:
     missing: set[str] = field(default_factory=set)  # known markers that were not found
     unsure: set[str] = field(default_factory=set)  # names that may be second ones of a marker
     turns: dict[str, Float] = field(default_factory=dict)  # rotations of known segments
+    seen: dict[str, Seen] = field(default_factory=dict)  # known segments as their markers were measured
     told: str = ""  # what a reader should know of its pairs though nothing is wrong
 
 
@@ -76,11 +79,12 @@ def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) 
         for index in indices:
             if exams[index]["exams"][0]["status"] == "failed":
                 continue
-            rows = exams[index] if known is None else settle_pairs(exams[index], known, limits)
+            bodies = [_body_of(segment, earlier) for segment in known or ()]
+            rows = exams[index] if known is None else settle_pairs(exams[index], bodies, limits)
             exam = _open(rows)
             if known is not None:
                 exam.told = _settled(exams[index], rows)
-                _name_by_segments(exam, earlier, known, limits)
+                _name_by_segments(exam, earlier, known, bodies, limits)
             used = _name_by_earlier(exam, earlier, used, limits)
             earlier.append(exam)
             result[index] = _renamed(exam)
@@ -101,11 +105,18 @@ def _settled(before: Rows, after: Rows) -> str:
     return "the known segments decide the doubtful pairs"
 
 
-def _name_by_segments(exam: _Exam, earlier: Sequence[_Exam], segments: Sequence[Segment], limits: Limits) -> None:
+def _body_of(segment: Segment, earlier: Sequence[_Exam]) -> Cloud:
+    """Return a segment as `segments.csv` tells it, and if it does so with errors as it was measured since, which tells smaller motions."""
+    body = Cloud.independent(segment.position_mm, segment.sd_mm)
+    if segment.sd_mm is None:
+        return body
+    return as_measured(body, [other.seen[segment.name] for other in earlier if segment.name in other.seen])
+
+
+def _name_by_segments(exam: _Exam, earlier: Sequence[_Exam], segments: Sequence[Segment], bodies: Sequence[Cloud], limits: Limits) -> None:
     if not segments:
         exam.findings.append(("marker-mismatch", f"segments.csv knows no segment of subject {exam.rows['exams'][0]['subject']}"))
         return
-    bodies = [Cloud.exact(segment.position_mm) for segment in segments]
     turns = {name: turn for other in earlier for name, turn in other.turns.items()}  # the last ones
     before = [turns.get(segment.name) for segment in segments]
     matched = match_segments(bodies, exam.cloud, limits.posterior, before)
@@ -120,6 +131,9 @@ def _name_by_segments(exam: _Exam, earlier: Sequence[_Exam], segments: Sequence[
             exam.flags[a] |= MarkerFlag.LOOSE
         if (placement := known.placement or sighting.placement) is not None:
             exam.turns[segment.name] = placement.rotation
+        if known.placement is not None:
+            sure = [(i, a) for i, a in known.pairs if (i, a) not in known.loose and not flag_value(exam.located[a]["flags"] or "") & UNSURE]
+            exam.seen[segment.name] = Seen(known.placement, tuple(sure), exam.cloud)
         if known.placement is None and sighting.placement is not None:
             known = replace(known, doubtful=())  # single rays decided
         for _, a in known.doubtful:

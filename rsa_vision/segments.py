@@ -16,9 +16,11 @@ from rsa_vision.errors import SettingsError
 from rsa_vision.types import Float
 
 COLUMNS: Final = ("subject", "segment", "marker", "x_mm", "y_mm", "z_mm")
+SD_COLUMNS: Final = ("sd_x_mm", "sd_y_mm", "sd_z_mm")  # all or none
 LEAST_MARKERS: Final = 3
 LEAST_HEIGHT_MM: Final = 1.0  # of the markers from the line that fits them best
 LEAST_DISTANCE_MM: Final = 0.2  # less is the same marker twice
+MOST_SD_MM: Final = 0.5  # with more, 4.5 sd of two markers, twice as large as stated, reach from one marker of a bone to the next
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,11 +33,14 @@ class Segment:
     markers : tuple of str
     position_mm : ndarray of shape (n, 3)
         In any rigid frame.
+    sd_mm : ndarray of shape (n, 3), optional
+        Standard deviations of these coordinates, independent of each other; None: they are exact.
     """
 
     name: str
     markers: tuple[str, ...]
     position_mm: Float
+    sd_mm: Float | None = None
 
 
 Segments = Mapping[str, Sequence[Segment]]
@@ -55,7 +60,8 @@ def read_segments(path: Path) -> dict[str, list[Segment]]:
     Parameters
     ----------
     path : Path
-        CSV file with the columns subject (may be empty: of everybody), segment, marker, x_mm, y_mm, z_mm; others are ignored.
+        CSV file with the columns subject (may be empty: of everybody), segment, marker, x_mm, y_mm, z_mm, and sd_x_mm, sd_y_mm, sd_z_mm
+        if the coordinates have errors; others are ignored.
 
     Returns
     -------
@@ -65,8 +71,8 @@ def read_segments(path: Path) -> dict[str, list[Segment]]:
     Raises
     ------
     SettingsError
-        If it cannot be read, lacks columns, names a marker twice or not at all, has values that are no numbers, or a segment whose markers
-        do not determine its pose; every error is listed with its line.
+        If it cannot be read, lacks columns, names a marker twice or not at all, has values that are no numbers or impossible standard
+        deviations, or a segment whose markers do not determine its pose; every error is listed with its line.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -76,7 +82,10 @@ def read_segments(path: Path) -> dict[str, list[Segment]]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SettingsError(f"{path}: not a readable CSV file ({error}); give a table with the columns {', '.join(COLUMNS)}") from error
     problems = [f"column {name} is missing" for name in COLUMNS if name not in header]
-    problems += [f"column {name} stands twice" for name in COLUMNS if header.count(name) > 1]
+    problems += [f"column {name} stands twice" for name in (*COLUMNS, *SD_COLUMNS) if header.count(name) > 1]
+    with_sd = any(name in header for name in SD_COLUMNS)
+    lacking = [name for name in SD_COLUMNS if name not in header] if with_sd else []
+    problems += [f"column {name} is missing: give the standard deviations of all three coordinates, or none" for name in lacking]
     if not (lines or problems):
         problems.append("there is no marker in it")
     found: dict[tuple[str, str], dict[str, tuple[float, ...]]] = {}
@@ -89,7 +98,8 @@ def read_segments(path: Path) -> dict[str, list[Segment]]:
         raise SettingsError(f"{path}: wrong segments\n" + "\n".join(f"  {problem}" for problem in problems))
     result: dict[str, list[Segment]] = {}
     for (subject, name), markers in found.items():
-        result.setdefault(subject, []).append(Segment(name, tuple(markers), np.array(list(markers.values()))))
+        values = np.array(list(markers.values()))
+        result.setdefault(subject, []).append(Segment(name, tuple(markers), values[:, :3], values[:, 3:] if values[:, 3:].any() else None))
     return result
 
 
@@ -111,26 +121,33 @@ def _read_line(header: list[str], cells: list[str], found: dict[tuple[str, str],
     row = dict(zip(header, cells, strict=True))
     problems = [f"{name} is empty" for name in ("segment", "marker") if not row[name]]
     problems += [f"{name} {row[name]!r} must not hold a slash" for name in ("segment", "marker") if "/" in row[name]]
-    place = []
-    for axis in COLUMNS[3:]:
-        try:
-            place.append(float(row[axis]))
-        except ValueError:
-            place.append(math.nan)
-        if not math.isfinite(place[-1]):
-            problems.append(f"{axis} is {row[axis]!r}, not a finite number")
+    place = [_number(row[axis]) for axis in COLUMNS[3:]]
+    problems += [
+        f"{axis} is {row[axis]!r}, not a finite number" for axis, x in zip(COLUMNS[3:], place, strict=True) if not math.isfinite(x)
+    ]
+    sd = {name: _number(row[name]) for name in SD_COLUMNS if name in header}
+    for name in (name for name, value in sd.items() if not 0 <= value <= MOST_SD_MM):
+        told = f"{name} of {row['segment']}/{row['marker']} is {row[name]!r}, not a standard deviation of 0 to {MOST_SD_MM:g} mm"
+        problems.append(f"{told}: correct it (0: exact), or leave the marker out")
     markers = found.setdefault((row["subject"], row["segment"]), {})
     if row["marker"] in markers:
         problems.append(f"marker {row['segment']}/{row['marker']} stands there already")
-    markers[row["marker"]] = tuple(place)
+    markers[row["marker"]] = (*place, *sd.values())
     return problems
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _doubts(subject: str, name: str, markers: Mapping[str, tuple[float, ...]]) -> list[str]:
     whose = f"segment {name}" + (f" of {subject}" if subject else "")
     if len(markers) < LEAST_MARKERS:
         return [f"{whose}: {len(markers)} markers, {LEAST_MARKERS} or more are needed to know it again: add markers or leave it out"]
-    places = np.array(list(markers.values()))
+    places = np.array(list(markers.values()))[:, :3]
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(len(places))
     names = list(markers)
     same = [(names[i], names[j]) for i, j in np.argwhere(apart < LEAST_DISTANCE_MM).tolist() if i < j]

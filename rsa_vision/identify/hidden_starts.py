@@ -70,13 +70,13 @@ def first_poses(scene: Scene, around_mm: Float | None) -> list[Start]:
 
 def _starts(scene: Scene) -> Iterator[Start]:
     body, places = scene.body, scene.points.position_mm
-    length = distances(body)[0]
+    length, variance = distances(body)
     for i, j in permutations(range(len(body)), 2):
         for a, base in enumerate(places):
             ends: list[tuple[Float, Pairs, Pairs]] = []
             for b, end in enumerate(places if i < j else ()):
                 spread = scene.points.covariance_mm2[a] + scene.points.covariance_mm2[b]
-                sd = np.sqrt(GATE_SCALE**2 * np.linalg.eigvalsh(spread)[-1] + 2 * TOLERANCE_MM**2)
+                sd = np.sqrt(GATE_SCALE**2 * (np.linalg.eigvalsh(spread)[-1] + variance[i, j]) + 2 * TOLERANCE_MM**2)
                 if a != b and abs(float(np.linalg.norm(end - base)) - length[i, j]) < GATE * sd:
                     ends.append((end, ((i, a), (j, b)), ()))
             for r in range(len(scene.rays)):

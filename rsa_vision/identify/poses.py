@@ -39,8 +39,14 @@ class Cloud(Table):
     @classmethod
     def exact(cls, position_mm: Float) -> Cloud:
         """Return points without errors of their own."""
+        return cls.independent(position_mm, None)
+
+    @classmethod
+    def independent(cls, position_mm: Float, sd_mm: Float | None) -> Cloud:
+        """Return points whose coordinates, shape (n, 3), have independent errors of these standard deviations, or none."""
         points = np.asarray(position_mm, np.float64).reshape(-1, 3)
-        return cls(points, np.zeros((len(points), 3, 3)))
+        sd = np.zeros_like(points) if sd_mm is None else np.asarray(sd_mm, np.float64).reshape(-1, 3)
+        return cls(points, sd[:, :, None] ** 2 * np.eye(3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsa_vision.tables import SCHEMAS
 from rsa_vision.types import MarkerImages
 from synthetic.study import RenderedExamination, render_examination
 
@@ -21,6 +22,19 @@ SD_PX = 0.02
 def content(values: Any) -> str:
     """Return a hash of the pixels."""
     return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
+
+
+def rows_of(exam: str, places_mm: np.ndarray, flags: str = "", reasons: str = "", *, sd_mm: float = 0.01) -> Any:
+    """The tables of an examination with markers at places, without images."""
+    markers = [
+        dict.fromkeys(SCHEMAS["markers"])
+        | {"subject": "S", "exam": exam, "segment": "", "marker": f"P{k + 1:02d}", "n_views": 2, "flags": flags}
+        | dict(zip(("x_mm", "y_mm", "z_mm"), place.tolist(), strict=True))
+        | {f"sd_{axis}_mm": sd_mm for axis in "xyz"}
+        for k, place in enumerate(places_mm)
+    ]
+    about = {"subject": "S", "exam": exam, "status": "review" if reasons else "ok", "reasons": reasons, "message": ""}
+    return {"exams": [about], "images": [], "foci": [], "markers": markers}
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from rsa_vision.sightlines import Sightlines
 from rsa_vision.tables import SCHEMAS
 from rsa_vision.types import MarkerImages
 from synthetic.study import make_study
-from tests.cli.conftest import SD_PX, content
+from tests.cli.conftest import SD_PX, content, rows_of
 from tests.identify.bodies import seen_from
 
 TEXT = {"subject": pl.String, "exam": pl.String, "segment": pl.String, "marker": pl.String, "flags": pl.String, "number": pl.String}
@@ -181,19 +181,6 @@ def test_segments_of_another_object_are_never_ok(films: Path, hide: Any, tmp_pat
     table.write_csv(tmp_path / "mirrored.csv")
     assert run_app(["measure", str(films), "-o", str(tmp_path / "out"), "--segments", str(tmp_path / "mirrored.csv")]) == 1
     assert all(status == "review" and "marker-mismatch" in reasons for status, reasons in exams(tmp_path / "out").values())
-
-
-def rows_of(exam: str, places_mm: np.ndarray, flags: str = "", reasons: str = "") -> Any:
-    """The tables of an examination with markers at places, without images."""
-    markers = [
-        dict.fromkeys(SCHEMAS["markers"])
-        | {"subject": "S", "exam": exam, "segment": "", "marker": f"P{k + 1:02d}", "n_views": 2, "flags": flags}
-        | dict(zip(("x_mm", "y_mm", "z_mm"), place.tolist(), strict=True))
-        | {f"sd_{axis}_mm": 0.01 for axis in "xyz"}
-        for k, place in enumerate(places_mm)
-    ]
-    about = {"subject": "S", "exam": exam, "status": "review" if reasons else "ok", "reasons": reasons, "message": ""}
-    return {"exams": [about], "images": [], "foci": [], "markers": markers}
 
 
 def test_names_given_twice_are_the_same_and_too_few_markers_are_never_named() -> None:
