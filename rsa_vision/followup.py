@@ -73,18 +73,23 @@ def follow_up(exams: Sequence[Rows], segments: Segments | None, limits: Limits) 
         subjects.setdefault(rows["exams"][0]["subject"], []).append(index)
     result = list(exams)
     for subject, indices in subjects.items():
-        known = None if segments is None else segments_of(segments, subject)
+        told = [] if segments is None else segments_of(segments, subject)
+        known = [segment for segment in told if not segment.problem]
+        problems: list[Finding] = [("constellation-ambiguous", segment.problem) for segment in told if segment.problem]
         earlier: list[_Exam] = []
         used = 0
         for index in indices:
             if exams[index]["exams"][0]["status"] == "failed":
                 continue
-            bodies = [_body_of(segment, earlier) for segment in known or ()]
-            rows = exams[index] if known is None else settle_pairs(exams[index], bodies, limits)
+            bodies = [_body_of(segment, earlier) for segment in known]
+            rows = settle_pairs(exams[index], bodies, limits) if bodies else exams[index]
             exam = _open(rows)
-            if known is not None:
+            exam.findings += problems
+            if known:
                 exam.told = _settled(exams[index], rows)
                 _name_by_segments(exam, earlier, known, bodies, limits)
+            elif segments is not None and not problems:
+                exam.findings.append(("marker-mismatch", f"segments.csv knows no segment of subject {subject}"))
             used = _name_by_earlier(exam, earlier, used, limits)
             earlier.append(exam)
             result[index] = _renamed(exam)
@@ -114,9 +119,6 @@ def _body_of(segment: Segment, earlier: Sequence[_Exam]) -> Cloud:
 
 
 def _name_by_segments(exam: _Exam, earlier: Sequence[_Exam], segments: Sequence[Segment], bodies: Sequence[Cloud], limits: Limits) -> None:
-    if not segments:
-        exam.findings.append(("marker-mismatch", f"segments.csv knows no segment of subject {exam.rows['exams'][0]['subject']}"))
-        return
     turns = {name: turn for other in earlier for name, turn in other.turns.items()}  # the last ones
     before = [turns.get(segment.name) for segment in segments]
     matched = match_segments(bodies, exam.cloud, limits.posterior, before)

@@ -35,12 +35,15 @@ class Segment:
         In any rigid frame.
     sd_mm : ndarray of shape (n, 3), optional
         Standard deviations of these coordinates, independent of each other; None: they are exact.
+    problem : str
+        Why its markers cannot be known again, and what to do; empty if they can.
     """
 
     name: str
     markers: tuple[str, ...]
     position_mm: Float
     sd_mm: Float | None = None
+    problem: str = ""
 
 
 Segments = Mapping[str, Sequence[Segment]]
@@ -66,13 +69,13 @@ def read_segments(path: Path) -> dict[str, list[Segment]]:
     Returns
     -------
     dict of str to list of Segment
-        By subject, in the order of the file.
+        By subject, in the order of the file; those whose markers do not determine a pose say so as their problem.
 
     Raises
     ------
     SettingsError
-        If it cannot be read, lacks columns, names a marker twice or not at all, has values that are no numbers or impossible standard
-        deviations, or a segment whose markers do not determine its pose; every error is listed with its line.
+        If it cannot be read, lacks columns, names a marker twice or not at all, or has values that are no numbers or impossible standard
+        deviations; every error is listed with its line.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -92,14 +95,14 @@ def read_segments(path: Path) -> dict[str, list[Segment]]:
     if not problems:
         for line, cells in lines:
             problems += [f"line {line}: {problem}" for problem in _read_line(header, cells, found)]
-    if not problems:
-        problems = [text for (subject, name), markers in found.items() for text in _doubts(subject, name, markers)]
     if problems:
         raise SettingsError(f"{path}: wrong segments\n" + "\n".join(f"  {problem}" for problem in problems))
     result: dict[str, list[Segment]] = {}
     for (subject, name), markers in found.items():
         values = np.array(list(markers.values()))
-        result.setdefault(subject, []).append(Segment(name, tuple(markers), values[:, :3], values[:, 3:] if values[:, 3:].any() else None))
+        place, sd = values[:, :3], values[:, 3:]
+        problem = _problem(subject, name, tuple(markers), place)
+        result.setdefault(subject, []).append(Segment(name, tuple(markers), place, sd if sd.any() else None, problem))
     return result
 
 
@@ -143,16 +146,14 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _doubts(subject: str, name: str, markers: Mapping[str, tuple[float, ...]]) -> list[str]:
-    whose = f"segment {name}" + (f" of {subject}" if subject else "")
+def _problem(subject: str, name: str, markers: Sequence[str], places: Float) -> str:
+    whose = f"segment {name}" + (f" of {subject}" if subject else "") + " in segments.csv"
     if len(markers) < LEAST_MARKERS:
-        return [f"{whose}: {len(markers)} markers, {LEAST_MARKERS} or more are needed to know it again: add markers or leave it out"]
-    places = np.array(list(markers.values()))[:, :3]
-    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(len(places))
-    names = list(markers)
-    same = [(names[i], names[j]) for i, j in np.argwhere(apart < LEAST_DISTANCE_MM).tolist() if i < j]
+        return f"{whose}: {len(markers)} markers, {LEAST_MARKERS} or more are needed to know it again: add markers or leave it out"
+    apart = np.linalg.norm(places[:, None] - places, axis=-1)
+    same = [f"{markers[i]} and {markers[j]}" for i, j in np.argwhere(apart < LEAST_DISTANCE_MM).tolist() if i < j]
     if same:
-        return [f"{whose}: {a} and {b} are the same place: correct one of them" for a, b in same]
+        return f"{whose}: {', '.join(same)} are the same place: correct one of them"
     if np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] < LEAST_HEIGHT_MM:
-        return [f"{whose}: its markers lie in line and determine no pose: add a marker beside the line, or leave it out"]
-    return []
+        return f"{whose}: its markers lie in line and determine no pose: add a marker beside the line, or leave it out"
+    return ""

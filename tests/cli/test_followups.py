@@ -317,9 +317,6 @@ HEAD = "subject,segment,marker,x_mm,y_mm,z_mm\n"
             HEAD + "S,a,1,0,0,zero\nS,a,1,nan,0,0\n,b/c,,0,0,0\nS,a\n",
             ["line 2: z_mm", "line 3: x_mm", "stands there", "slash", "marker is empty", "2 values"],
         ),
-        (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\n", ["2 markers"]),
-        (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\nS,a,3,20,0,0.1\n", ["in line"]),
-        (HEAD + "S,a,1,0,0,0\nS,a,2,10,0,0\nS,a,3,0,20,0\nS,a,4,0,20,0.1\n", ["same place"]),
     ],
 )
 def test_segments_that_cannot_be_used_are_refused_with_every_error(text: str, said: list[str], tmp_path: Path) -> None:
@@ -328,6 +325,31 @@ def test_segments_that_cannot_be_used_are_refused_with_every_error(text: str, sa
     with pytest.raises(SettingsError) as error:
         read_segments(path)
     assert all(part in str(error.value) for part in said)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ("{},a,1,0,0,0\n{},a,2,10,0,0\n", "2 markers"),
+        ("{},a,1,0,0,0\n{},a,2,10,0,0\n{},a,3,20,0,0.1\n", "in line"),
+        ("{},a,1,0,0,0\n{},a,2,10,0,0\n{},a,3,0,20,0\n{},a,4,0,20,0.1\n", "3 and 4 are the same place"),
+    ],
+)
+@pytest.mark.parametrize("whose", ["S", ""])
+def test_a_segment_that_determines_no_pose_is_an_error_of_its_subject_alone(lines: str, said: str, whose: str, tmp_path: Path) -> None:
+    body, path = np.random.default_rng(1).normal(0, 20, (2, 6, 3)), tmp_path / "segments.csv"
+    good = [f"{subject},b,{k},{','.join(map(str, place))}\n" for subject, at in zip("ST", body, strict=True) for k, place in enumerate(at)]
+    path.write_text(HEAD + lines.replace("{}", whose) + "".join(good))
+    first, last, other = rows_of("1", body[0]), rows_of("2", body[0] + 3), rows_of("1", body[1])
+    for row in (*other["exams"], *other["markers"]):
+        row["subject"] = "T"
+    *mine, foreign = follow_up([first, last, other], read_segments(path), Limits())
+    for rows in (*mine, *([] if whose else [foreign])):
+        assert (rows["exams"][0]["status"], rows["exams"][0]["reasons"]) == ("review", "constellation-ambiguous")
+        assert said in rows["exams"][0]["message"]
+    if whose:
+        assert foreign["exams"][0]["status"] == "ok"
+    assert all((row["segment"], row["flags"]) == ("b", "") for rows in (*mine, foreign) for row in rows["markers"])  # nothing is lost by it
 
 
 def test_proposals_need_two_examinations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
