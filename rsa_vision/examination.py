@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Final
+from typing import Final, TypedDict
 
 import numpy as np
 
-from rsa_vision.cages import Cage
+from rsa_vision.cages import Cage, builtin_cages, load_cage
 from rsa_vision.cameras import Camera
 from rsa_vision.detect import detect_markers
 from rsa_vision.errors import CalibrationError, RsaError
@@ -18,9 +18,10 @@ from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.cage import CageIdentification, identify_cage
 from rsa_vision.identify.crossings import Region, cage_region
 from rsa_vision.identify.pairs import Pairing, pair_rays
+from rsa_vision.identify.remedies import what_would_fit
 from rsa_vision.images import require_pitch
 from rsa_vision.readings import FilmReading, Readings, candidates, image_quality, joined_rays, lonely_images, name_marks, name_objects
-from rsa_vision.settings import Study
+from rsa_vision.settings import Limits, Study
 from rsa_vision.sightlines import Sightlines, by_cage, by_cameras, left_open, single_images
 from rsa_vision.threads import in_one_thread
 from rsa_vision.types import Film, Float, ImagePoints, Int, Reconstruction
@@ -31,6 +32,17 @@ SAME_PITCH: Final = 1e-4  # relative: what tags round differently; over a film o
 TIP_ERROR: Final = 0.01
 """Part of the half width: what the fits of all points of a cage have in common where the points are no cones (rounded, or cylinders with
 a short point). Root mean square over 33 films of another renderer; at the worst 3 %."""
+
+
+class _Told(TypedDict):
+    """What a user, or the file, tells of a film."""
+
+    pitch_mm: tuple[float, float]
+    film_shape: tuple[int, int]
+    orientation: str
+    foci_mm: Mapping[int, Sequence[float]]
+    limits: Limits
+
 
 ExposedFilm = tuple[Film, int | None]
 """A film and the focus that it belongs to, None for all foci."""
@@ -168,7 +180,7 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
         return _failed(table, differing)
     cage = cage.at_temperature(study.temperature_c)
     marks = [_identify(film, study, cage) for film in table.films[: n_cage_films or None]]
-    findings = [(code, _explain(code, m, film)) for film, m in zip(table.films, marks, strict=False) for code in m.reasons]
+    findings = [(code, _explain(code, m, film, study, cage)) for film, m in zip(table.films, marks, strict=False) for code in m.reasons]
     if not all(marks):
         return _failed(table, findings)
     named, free, foreign = name_marks(table, marks, n_cage_films)
@@ -274,30 +286,38 @@ def _nominal(study: Study, cage: Cage) -> dict[int, tuple[float, float, float]]:
 
 
 def _identify(film: FilmReading, study: Study, cage: Cage) -> CageIdentification:
+    return identify_cage(film.images, cage, _foci(film, cage), **_told(film, study, cage))
+
+
+def _foci(film: FilmReading, cage: Cage) -> tuple[int, ...]:
+    return tuple(sorted(cage.foci)) if film.focus is None else (film.focus,)
+
+
+def _told(film: FilmReading, study: Study, cage: Cage) -> _Told:
     assert film.pitch_mm is not None  # a cage needs the pitch: required before
-    return identify_cage(
-        film.images,
-        cage,
-        tuple(sorted(cage.foci)) if film.focus is None else (film.focus,),
-        pitch_mm=film.pitch_mm,
-        film_shape=film.shape,
-        orientation=study.orientation,
-        foci_mm=_nominal(study, cage),
-        limits=study.limits,
-    )
+    return {
+        "pitch_mm": film.pitch_mm,
+        "film_shape": film.shape,
+        "orientation": study.orientation,
+        "foci_mm": _nominal(study, cage),
+        "limits": study.limits,
+    }
 
 
-def _explain(code: str, found: CageIdentification, film: FilmReading) -> str:
+def _explain(code: str, found: CageIdentification, film: FilmReading, study: Study, cage: Cage) -> str:
     why = code.replace("-", " ")
     if code == "cage-not-found":
         why = f"the cage was not found among {len(film.images)} marker images: {found.runner_up or 'too few of its marks'}"
+        others = [load_cage(name) for name in builtin_cages()]
+        if fits := what_would_fit(film.images, cage, _foci(film, cage), **_told(film, study, cage), others=others):
+            why += f"; it would be found with {' or with '.join(fits)}: look which is true"
     if code == "cage-ambiguous":
         why = f"posterior of the names {found.posterior:.4f}; the rival: {found.runner_up or 'images at random'}"
     return f"{film.path.name}: {why}"
 
 
 def _stretch(film: FilmReading, found: CageIdentification) -> list[Finding]:
-    assert film.pitch_mm is not None  # as in _identify
+    assert film.pitch_mm is not None  # as in _told
     findings: list[Finding] = []
     for focus, homography in found.plane_from_film.items():
         images = [image for (role, _), image in found.assignments[focus].items() if role == "fiducial"]

@@ -308,3 +308,11 @@ def test_a_mistyped_setting_is_named_with_the_one_that_is_meant(tmp_path: Path) 
     (tmp_path / "study.toml").write_text("pixel_pich_mm = 0.1\n[limits]\nposterier = 0.99\n")
     with pytest.raises(rsa_vision.RsaError, match=r"posterior meant(.|\n)*pixel_pitch_mm meant"):
         rsa_vision.measure(tmp_path, tmp_path / "out", study=tmp_path / "study.toml")
+
+
+@pytest.mark.usefixtures("count_detections")
+def test_a_cage_that_is_not_found_says_with_which_pitch_it_would_be(folder: Path, tmp_path: Path) -> None:
+    assert run_app(["measure", str(folder), "-o", str(tmp_path / "out"), "--pixel-pitch-mm", "0.1"]) == 1  # it is 0.15
+    for row in pl.read_csv(tmp_path / "out" / "exams.csv").to_dicts():
+        assert (row["status"], row["reasons"]) == ("failed", "cage-not-found")
+        assert row["message"].count("it would be found with pixel_pitch_mm = 0.15 or so instead of 0.1: look which is true") == 2
