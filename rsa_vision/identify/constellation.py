@@ -186,7 +186,7 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
         again = [(tuple((int(mine[i]), int(theirs[a])) for i, a in pairs), placement) for pairs, placement in left]
         rigid = {**dict(listed), **dict(again)}
         rivals = _additions(before, points, rigid, named, volume)
-        few, uncounted = rivals[:MOST_RIVALS], rivals[MOST_RIVALS:]
+        few, uncounted = _counted(rivals, len(points))
         triples = [pairs for _, pairs, _ in few if pairs in rigid and len(pairs) == LEAST_POINTS]
         turned = dict(loose_triples(before, points, triples, LOOSE, LOOSE_MM))
         competing = [*few, *_additions(before, points, turned, named, volume)]
@@ -251,6 +251,18 @@ def _additions(
 
 def _log_ways(n: int, k: int) -> float:
     return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+
+
+def _counted(rivals: list[tuple[float, Pairs, float]], m: int) -> tuple[list[tuple[float, Pairs, float]], list[tuple[float, Pairs, float]]]:
+    """Return the rivals that are summed, and the others: the likeliest, and the best explanation by those that say most for each point.
+
+    Where two bodies together fit one pose badly, both at once are likelier by far than the larger one, but each alone is not, and parts of
+    that would leave neither among the likeliest.
+    """
+    few, others = rivals[:MOST_RIVALS], rivals[MOST_RIVALS:]
+    dense = sorted(rivals, key=lambda rival: (-rival[0] / len(rival[1]), rival[1]))[:MOST_RIVALS] if others else []
+    apart = [dense[g] for g in _summed(dense, m)[1]]
+    return few + [one for one in others if one in apart], [one for one in others if one not in apart]
 
 
 def _summed(rivals: Sequence[tuple[float, Pairs, float]], m: int) -> tuple[dict[tuple[int, int], float], list[int]]:
