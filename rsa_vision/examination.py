@@ -18,7 +18,7 @@ from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.cage import CageIdentification, identify_cage
 from rsa_vision.identify.crossings import Region, cage_region
 from rsa_vision.identify.pairs import Pairing, pair_rays
-from rsa_vision.identify.remedies import what_would_fit
+from rsa_vision.identify.remedies import is_decisive, what_would_fit
 from rsa_vision.images import require_pitch
 from rsa_vision.readings import FilmReading, Readings, candidates, image_quality, joined_rays, lonely_images, name_marks, name_objects
 from rsa_vision.settings import Limits, Study
@@ -313,6 +313,8 @@ def _explain(code: str, found: CageIdentification, film: FilmReading, study: Stu
             why += f"; it would be found with {' or with '.join(fits)}: look which is true"
     if code == "cage-ambiguous":
         why = f"posterior of the names {found.posterior:.4f}; the rival: {found.runner_up or 'images at random'}"
+        if study.orientation == "any" and is_decisive(_identify(film, study.model_copy(update={"orientation": "upright"}), cage)):
+            why += '; orientation = "upright" decides if the film lies so; if it was turned over by 180 deg, turn it back first'
     return f"{film.path.name}: {why}"
 
 

@@ -55,20 +55,25 @@ def what_would_fit(
     found = [f'orientation = "{other}"' for other in ORIENTATIONS[orientation] if told(orientation=other)][:1]
     if len(foci) == 1:
         as_of = partial(identify, cage, pitch_mm=pitch_mm, foci_mm=foci_mm, orientation=orientation)
-        found += [f"focus {focus} instead of {foci[0]}" for focus in sorted(cage.foci) if focus not in foci and _fits(as_of((focus,)))]
+        found += [
+            f"focus {focus} instead of {foci[0]}" for focus in sorted(cage.foci) if focus not in foci and is_decisive(as_of((focus,)))
+        ]
     possible = [other for other in others if other.name != cage.name and other.film == cage.film and set(foci) <= set(other.foci)]
-    found += [f'cage = "{other.name}"' for other in possible if _fits(identify(other, foci, pitch_mm=pitch_mm, orientation=orientation))]
+    found += [
+        f'cage = "{other.name}"' for other in possible if is_decisive(identify(other, foci, pitch_mm=pitch_mm, orientation=orientation))
+    ]
     if len(images) <= MOST_IMAGES:
         xy_mm = images.position_px @ np.diag([-pitch_mm[1] if orientation == "mirrored" else pitch_mm[1], -pitch_mm[0]])
         for factor in _factors(xy_mm, build_scene(cage, tuple(foci), {f: np.asarray(place) for f, place in foci_mm.items()}), orientation):
             scaled = (pitch_mm[0] * factor, pitch_mm[1] * factor)
-            if _fits(told(orientation=orientation, pitch_mm=scaled)):
+            if is_decisive(told(orientation=orientation, pitch_mm=scaled)):
                 found.append(f"pixel_pitch_mm = {scaled[1]:.2g} or so instead of {pitch_mm[1]:.3g}")
                 break
     return tuple(found)
 
 
-def _fits(found: CageIdentification) -> bool:
+def is_decisive(found: CageIdentification) -> bool:
+    """Tell whether the cage was found, in one way only."""
     return bool(found) and "cage-ambiguous" not in found.reasons
 
 

@@ -316,3 +316,12 @@ def test_a_cage_that_is_not_found_says_with_which_pitch_it_would_be(folder: Path
     for row in pl.read_csv(tmp_path / "out" / "exams.csv").to_dicts():
         assert (row["status"], row["reasons"]) == ("failed", "cage-not-found")
         assert row["message"].count("it would be found with pixel_pitch_mm = 0.15 or so instead of 0.1: look which is true") == 2
+
+
+@pytest.mark.usefixtures("count_detections")
+def test_names_that_may_be_turned_over_say_that_upright_decides(folder: Path, tmp_path: Path) -> None:
+    for orientation, status in (("any", "review"), ("upright", "ok")):
+        run_app(["measure", str(folder), "-o", str(tmp_path / orientation), "--orientation", orientation])
+        for row in pl.read_csv(tmp_path / orientation / "exams.csv").to_dicts():
+            assert row["status"] == status
+            assert ('orientation = "upright" decides if the film lies so' in (row["message"] or "")) == (orientation == "any")
