@@ -14,11 +14,11 @@ import numpy as np
 
 from rsa_vision.contests import cloud_of, settle_pairs
 from rsa_vision.flags import MarkerFlag, flag_names, flag_value
-from rsa_vision.geometry.rigid import LEAST_POINTS
-from rsa_vision.identify.constellation import LOOSE_SIGMA, Known, match_bodies, match_segments
+from rsa_vision.identify.constellation import Known, match_bodies, match_segments
 from rsa_vision.identify.hidden import Sighting
 from rsa_vision.identify.known_bodies import Seen, as_measured
-from rsa_vision.identify.poses import Cloud, Pairs, place
+from rsa_vision.identify.loose import loose_pairs
+from rsa_vision.identify.poses import Cloud
 from rsa_vision.ordering import natural_key
 from rsa_vision.segments import Segment, Segments, segments_of
 from rsa_vision.settings import Limits
@@ -198,11 +198,10 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
         old = other.cloud.rows(np.array(before, dtype=np.int64))
         bodies, doubts = match_bodies(old, points, limits.posterior)
         doubtful |= doubts
-        for body in bodies:
-            for (i, a), moved in zip(body, _have_moved(body, bodies, old, points), strict=True):
-                given.setdefault(a, set()).add(other.names[before[i]])
-                if moved:
-                    exam.flags[left[a]] |= MarkerFlag.LOOSE
+        for i, a in (pair for body in bodies for pair in body):
+            given.setdefault(a, set()).add(other.names[before[i]])
+        for _, a in loose_pairs(bodies, old, points, limits.posterior):
+            exam.flags[left[a]] |= MarkerFlag.LOOSE
     once = [name for names in given.values() for name in names]
     agreed = {a: next(iter(names)) for a, names in given.items() if len(names) == 1 and once.count(next(iter(names))) == 1}
     for a, name in agreed.items():
@@ -228,22 +227,6 @@ def _name_by_earlier(exam: _Exam, earlier: Sequence[_Exam], used: int, limits: L
         exam.findings += _earlier_findings(exam, [left[a] for a in new], [left[a] for a in new if doubtful[a]], known)
         _name_hidden(exam, earlier[0], limits)
     return used
-
-
-def _have_moved(body: Pairs, bodies: Sequence[Pairs], before: Cloud, points: Cloud) -> list[bool]:
-    """Say which markers of a rigid group are not where its others say; of too small a group, where none of the larger ones does.
-
-    Some of a larger group may have been enough to name a marker that all of it would not.
-    """
-
-    def sigmas(pairs: Pairs) -> list[float]:
-        placement = place(before, points, pairs)
-        return [0.0] * len(pairs) if placement is None else placement.sigmas.tolist()
-
-    if len(body) >= LEAST_POINTS:
-        return [sigma > LOOSE_SIGMA for sigma in sigmas(body)]
-    whole = [other for other in bodies if len(other) >= LEAST_POINTS]
-    return [bool(whole) and all(sigmas((*other, pair))[-1] > LOOSE_SIGMA for other in whole) for pair in body]
 
 
 def _name_hidden(exam: _Exam, first: _Exam, limits: Limits) -> None:

@@ -80,7 +80,7 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float, b
     rivals = [(index, *rival) for index, body in enumerate(segments) for rival in _rivals(body, points, volume, stray)]
     claims = [(*(a for _, a in (*rigid, *loose)), len(points) + index) for index, _, rigid, loose, _ in rivals]
     since = [None] * len(segments) if before is None else before
-    usual = [0.0 if (turn := since[index]) is None else _log_usual(turn, after) for index, *_, after in rivals]
+    usual = [0.0 if (turn := since[index]) is None else log_usual(turn, after) for index, *_, after in rivals]
     chosen, chances = _packed(claims, [odds for _, odds, *_ in rivals], usual)
     known = []
     for index, segment in enumerate(segments):
@@ -98,7 +98,7 @@ def _packed(claims: Sequence[tuple[int, ...]], odds: Sequence[float], usual: Seq
     return packing.chosen, np.nan_to_num([packing.posterior, as_usual.posterior])
 
 
-def _log_usual(before: Float, after: Float) -> float:
+def log_usual(before: Float, after: Float) -> float:
     """Return the log density of a rotation after another one, over that of any rotation."""
     squared_rad = np.arccos(np.clip((np.trace(after @ before.T) - 1) / 2, -1, 1)) ** 2
     small = 8 * np.pi**2 / (2 * np.pi * TURN_RAD**2) ** 1.5 * np.exp(-squared_rad / (2 * TURN_RAD**2))
@@ -238,7 +238,7 @@ def _additions(
         if not new or 0 < len(old) < LEAST_POINTS:
             continue
         odds = k * float(np.log(FOUND)) - _log_ways(n, k)  # any k may be the body
-        usual = 0.0 if old else _log_usual(np.eye(3), placement.rotation)
+        usual = 0.0 if old else log_usual(np.eye(3), placement.rotation)
         if not old:
             odds += _odds(placement, k, volume, m)
         else:
