@@ -46,12 +46,12 @@ def as_measured(body: Cloud, seen: Sequence[Seen]) -> Cloud:
     position, covariance = body.position_mm.copy(), body.covariance_mm2.copy()
     measured: set[int] = set()
     for one in seen:
-        turn, by_pose = one.placement.rotation, one.placement.predict(position)[1]
-        if not measured:
-            covariance += turn.T @ by_pose @ turn
         new = [(i, a) for i, a in one.pairs if i not in measured]
         if not new:
             continue
+        turn, by_pose = one.placement.rotation, one.placement.predict(position)[1]
+        if not measured:
+            covariance += turn.T @ by_pose @ turn
         marker, point = np.array(new, np.int64).T
         errors = one.points.covariance_mm2[point] + (by_pose[marker] if measured else 0.0)
         position[marker] = (one.points.position_mm[point] - one.placement.translation) @ turn

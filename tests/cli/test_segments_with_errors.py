@@ -181,6 +181,14 @@ def test_a_body_as_measured_agrees_with_later_points_as_its_covariances_say() ->
     assert 0.9 < np.sqrt(np.mean(np.square(sigmas))) < 1.1
 
 
+def test_an_examination_whose_markers_are_all_doubtful_tells_nothing_of_a_body() -> None:
+    body = Cloud.independent(np.diag([10.0, 20, 30]), np.full((3, 3), 0.1))
+    placement = place(body, body, ((0, 0), (1, 1), (2, 2)))
+    assert placement is not None
+    once, again = (as_measured(body, [Seen(placement, (), body)] * n + [Seen(placement, ((0, 0),), body)]) for n in (0, 2))
+    np.testing.assert_array_equal(again.covariance_mm2, once.covariance_mm2)
+
+
 def test_standard_deviations_are_read_and_zeros_are_as_good_as_none(tmp_path: Path) -> None:
     path = tmp_path / "segments.csv"
     path.write_text(HEAD + "sd_x_mm,sd_y_mm,sd_z_mm\n" + BONE.format("0.1,0.1,0.2", "0.1,0.1,0.2", "0,0,0.5"))
