@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import STRENGTH, significance_limit
 from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
+from rsa_vision.detect.film.wavelets import height_of_waves
 from rsa_vision.detect.marks.found import marks_of
 from rsa_vision.detect.marks.polarity import are_of_one_kind, first_looks, is_mottled, likelier, of_doubtful_polarity, polarities
 from rsa_vision.detect.marks.response import BITS, high_balls, in_film_values, is_straighter, log_odds
+from rsa_vision.detect.marks.waves import like_waves
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.first_pins import MOST_STROKES, look_for_pins
 from rsa_vision.detect.search.candidates import find_candidates
@@ -77,7 +79,9 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
         return Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
     images = [detection.images for _, detection in found]
     which, contested = likelier(images, [evidence for evidence, _ in found])
-    return replace(found[which][1], images=of_doubtful_polarity(images[which]) if contested else images[which])
+    chosen = of_doubtful_polarity(images[which]) if contested else images[which]
+    height = height_of_waves(values, noise.floor, noise.ceiling) / (2**bits - 1)
+    return replace(found[which][1], images=like_waves(chosen, height, found[which][1].optics))
 
 
 def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, only: int | None = None) -> list[tuple[float, Detection]]:
