@@ -16,6 +16,7 @@ from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
 from rsa_vision.detect.balls.unlike import of_odd_size
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.marks.beaded import find_beaded
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.marks.noise_curve import noise_by_value
 from rsa_vision.detect.marks.polarity import Seen, off_pins
@@ -27,6 +28,7 @@ from rsa_vision.detect.marks.unsteady import Marks, by_lines, unsteady_lines
 from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.balls_beside import lapped
 from rsa_vision.detect.needles.first_pins import look_for_pins
 from rsa_vision.detect.needles.fits import significant_misfit
 from rsa_vision.detect.needles.pins import find_pins
@@ -89,6 +91,9 @@ def marks_of(
     faint = _of_sign(faint, seen.sign)
     needles = _find_needles(film, mine, faint, candidates.strokes, rough_pins, seen)
     found, tees = _find_balls(film, mine, faint, needles, seen, limit, mottled=mottled)
+    if beaded := _with_beaded(film, found, needles, seen):
+        needles = beaded
+        found, tees = _find_balls(film, mine, faint, needles, seen, limit, mottled=mottled)
     needles = replace(needles, tees=tees)
     around = _around(film, found, needles, seen.optics, seen.noise)
     if around.under > _MUCH_MORE and seen.noise.blur_px > _SMOOTHED * seen.optics.sigma_px:
@@ -111,6 +116,7 @@ class _Needles:
     pins: list[NeedleFit]
     doubtful: list[NeedleFit]  # tees with something else on them
     tee_optics: Optics
+    pin_optics: Optics
     looks: BallFits  # at balls, less those at pins
     painted: Painted | None  # images of the tees and pins
 
@@ -133,8 +139,23 @@ def _find_needles(
     lines = _long_places(mine, seen.looks)
     pins, pin_optics = find_pins(film, rough_pins, places[~on_arms(places, perhaps)], lines, perhaps, sign, optics, noise)
     tees, pins = [_seen(tees, noise), _seen([p for p in pins if is_located(p)], noise)]
-    painted = paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
-    return _Needles(tees, pins, doubtful, tee_optics, off_pins(seen.looks, more_pins), painted)
+    painted = _painted(tees, pins, tee_optics, pin_optics)
+    return _Needles(tees, pins, doubtful, tee_optics, pin_optics, off_pins(seen.looks, more_pins), painted)
+
+
+def _with_beaded(film: NDArray[Any], found: Balls, needles: _Needles, seen: Seen) -> _Needles | None:
+    """Return the needles with the pins that balls have hidden, if there are any, fitted beside these."""
+    if needles.painted is None:
+        return None
+    fitted = find_beaded(film, needles.pins, needles.painted, found.fits, seen.optics, needles.pin_optics, seen.noise)
+    if fitted is None:
+        return None
+    pins = _seen([p for p in fitted[0] if is_located(p)], seen.noise)
+    return replace(needles, pins=pins, pin_optics=fitted[1], painted=_painted(needles.tees, pins, needles.tee_optics, fitted[1]))
+
+
+def _painted(tees: list[NeedleFit], pins: list[NeedleFit], tee_optics: Optics, pin_optics: Optics) -> Painted | None:
+    return paint([(t, tee_optics) for t in tees] + [(p, pin_optics) for p in pins]) if tees or pins else None
 
 
 def _seen(needles: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
@@ -284,6 +305,8 @@ def _measured(
     added = added[np.append(keep, np.ones(len(others), bool))]
     poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
     doubtful = lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
+    # a pin has one arm: what hides a part of it is felt at its tip
+    touching = np.concatenate([touching, np.zeros(len(needles.tees), bool), lapped(needles.pins, balls, optics)])
     return table_of(film, bits, balls, under, ratio, added, touching, poor, doubtful, others, faint.junctions, optics, noise)
 
 

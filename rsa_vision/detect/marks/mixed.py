@@ -1,4 +1,4 @@
-"""A ball on an arm of a tee: neither is one alone, together they are."""
+"""A ball on a pin or on an arm of a tee: neither is one alone, together they are."""
 
 from __future__ import annotations
 
@@ -31,29 +31,30 @@ _STEP_PX = 0.01  # for differences of the ball's image
 
 def part(
     film: NDArray[Any],
-    tee: NeedleFit,
+    needle: NeedleFit,
     balls: BallFits,
     optics: Optics,
-    tee_optics: Optics,
+    needle_optics: Optics,
     noise: NoiseModel,
     beside: Background,
-    is_tee: Callable[[NeedleFit], bool],
+    is_one: Callable[[NeedleFit], bool],
     start_px: Float | None = None,
 ) -> tuple[NeedleFit, BallFits] | None:
-    """Take a tee and a ball on it apart.
+    """Take a pin or a tee and a ball on it apart.
 
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
-    tee : NeedleFit
+    needle : NeedleFit
         That does not fit well enough alone.
     balls : BallFits
         Those of the film that stand alone: what the ball has to be like.
-    optics, tee_optics : Optics
+    optics, needle_optics : Optics
     noise : NoiseModel
     beside : callable
         Images of all other marks at pixels (cols, rows).
-    is_tee : callable
+    is_one : callable
+        Says whether a fit looks like a pin, or a tee.
     start_px : ndarray of shape (2,), optional
         Where the ball is; else it is looked for.
 
@@ -66,7 +67,7 @@ def part(
         return None
     radius, depth = float(np.median(balls.radius_px)), float(np.median(balls.depth))
 
-    def without_tee(cols: Float, rows: Float) -> Float:
+    def without_needle(cols: Float, rows: Float) -> Float:
         total: Float = beside(cols, rows) + arms(cols, rows)
         return total
 
@@ -75,39 +76,39 @@ def part(
         return total
 
     def fitted(at_px: Float, size: float) -> tuple[BallFits, Float, Background]:
-        return fit_one_over(film, at_px, size, without_tee, optics, noise, arms)
+        return fit_one_over(film, at_px, size, without_needle, optics, noise, arms)
 
     def sought() -> tuple[BallFits, Float, Background]:
-        return fitted(_brightest_rest(film, tee, np.sign(depth), without_tee) if start_px is None else start_px, radius)
+        return fitted(_brightest_rest(film, needle, np.sign(depth), without_needle) if start_px is None else start_px, radius)
 
-    arms = paint([(tee, tee_optics)])
+    arms = paint([(needle, needle_optics)])
     ball, doubt, shown = sought()
     for step in range(_ROUNDS):
-        tee = fit_crossing(film, [tee], tee_optics, noise, others=without_ball, steps=6)[0]
-        arms = paint([(tee, tee_optics)])
+        needle = fit_crossing(film, [needle], needle_optics, noise, others=without_ball, steps=6)[0]
+        arms = paint([(needle, needle_optics)])
         # what a ball has bent is no good guide to it
         ball, doubt, shown = sought() if step < _SOUGHT else fitted(ball.position_px[0], float(ball.radius_px[0]))
         if step == _SOUGHT and not (abs(np.log(ball.radius_px[0] / radius)) < np.log(_ROUGHLY) and ball.depth[0] / depth > 1 / _ROUGHLY):
             return None
     alike = abs(np.log(ball.radius_px[0] / radius)) < 0.25 and 0.4 < ball.depth[0] / depth < 2.5
-    if not (alike and plausible(ball, noise).all() and is_tee(tee)):
+    if not (alike and plausible(ball, noise).all() and is_one(needle)):
         return None
-    of_tee, of_ball = _joint_covariance(film, tee, ball, optics, tee_optics, noise)
-    excess = max(1.0, tee.chi2_core, float(ball.chi2_core[0]))
+    of_needle, of_ball = _joint_covariance(film, needle, ball, optics, needle_optics, noise)
+    excess = max(1.0, needle.chi2_core, float(ball.chi2_core[0]))
     of_ball = excess * of_ball
     of_ball[:2, :2] += doubt
-    return replace(tee, covariance_px2=excess * of_tee), replace(ball, covariance=of_ball[None])
+    return replace(needle, covariance_px2=excess * of_needle), replace(ball, covariance=of_ball[None])
 
 
 def _joint_covariance(
-    film: NDArray[Any], tee: NeedleFit, ball: BallFits, optics: Optics, tee_optics: Optics, noise: NoiseModel
+    film: NDArray[Any], needle: NeedleFit, ball: BallFits, optics: Optics, needle_optics: Optics, noise: NoiseModel
 ) -> tuple[Float, Float]:
     """Covariances of the tip (col, row) and of the ball (col, row, radius, depth) when both are free at once."""
-    half = int(np.ceil(1.2 * tee.shape.length_px + np.abs(tee.position_px - ball.position_px[0]).max() + 6))
-    patch = cut(film, tee.position_px[None], half, noise)
+    half = int(np.ceil(1.2 * needle.shape.length_px + np.abs(needle.position_px - ball.position_px[0]).max() + 6))
+    patch = cut(film, needle.position_px[None], half, noise)
     rows, cols = np.mgrid[0 : patch.size, 0 : patch.size].reshape(2, -1).astype(np.float64) + patch.corner_px[0][::-1, None]
-    dx, dy = cols - tee.position_px[0], rows - tee.position_px[1]
-    arms, *moves, turn = arm_images(dx, dy, tee.angles, tee.shape, tee_optics)
+    dx, dy = cols - needle.position_px[0], rows - needle.position_px[1]
+    arms, *moves, turn = arm_images(dx, dy, needle.angles, needle.shape, needle_optics)
     (x, y), radius, depth = ball.position_px[0], ball.radius_px[0], ball.depth[0]
 
     def image(x: float, y: float, radius: float) -> Float:
@@ -118,23 +119,23 @@ def _joint_covariance(
     h = _STEP_PX
     by_ball = [image(x + h, y, radius) - image(x - h, y, radius), image(x, y + h, radius) - image(x, y - h, radius)]
     by_ball += [image(x, y, radius + h) - image(x, y, radius - h)]
-    columns = [tee.depths @ m for m in moves] + [tee.depths @ turn, arms.sum(0)]
-    n_tee = len(columns)
+    columns = [needle.depths @ m for m in moves] + [needle.depths @ turn, arms.sum(0)]
+    n_needle = len(columns)
     columns += [depth * b / (2 * h) for b in by_ball] + [image(x, y, radius)]
     near = (np.hypot(dx, dy) < half) & patch.valid[0].ravel()
     jac = np.column_stack([*columns, polynomial(half, dx, dy)]) * near[:, None]
     sd = np.sqrt(noise.variance_at(patch.values[0].ravel()))
     weighted = jac / sd[:, None]
     covariance = np.linalg.pinv(weighted.T @ weighted, hermitian=True)
-    wanted = [0, 1, n_tee, n_tee + 1, n_tee + 2, n_tee + 3]
+    wanted = [0, 1, n_needle, n_needle + 1, n_needle + 2, n_needle + 3]
     whole = influence_covariance((covariance[wanted] @ weighted.T).reshape(6, patch.size, patch.size), noise.correlation)
     return whole[:2, :2], whole[2:, 2:]
 
 
-def _brightest_rest(film: NDArray[Any], tee: NeedleFit, sign: float, model: Callable[[Float, Float], Float]) -> Float:
-    """Place (col, row) near a tee where most is left over once the tee is taken away."""
-    reach = int(np.ceil(tee.shape.length_px + 8))
-    col, row = np.rint(tee.position_px).astype(np.intp)
+def _brightest_rest(film: NDArray[Any], needle: NeedleFit, sign: float, model: Callable[[Float, Float], Float]) -> Float:
+    """Place (col, row) near a needle where most is left over once this is taken away."""
+    reach = int(np.ceil(needle.shape.length_px + 8))
+    col, row = np.rint(needle.position_px).astype(np.intp)
     top, left = max(row - reach, 0), max(col - reach, 0)
     window = film[top : row + reach + 1, left : col + reach + 1].astype(np.float64)
     rows, cols = np.mgrid[top : top + window.shape[0], left : left + window.shape[1]].astype(np.float64)

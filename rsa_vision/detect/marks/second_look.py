@@ -148,17 +148,21 @@ def _over_lines(look: _Look, place: Float, known: BallFits) -> BallFits:
     others, place = look.beside(known), place[~_near(place, known, look.usual)]
     fits = balls_on_lines(look.film, place, look.usual, look.limit, look.optics, look.noise, others)
     fits = distinct(fits.rows(look.may_be(fits, known) & plausible(fits, look.noise, NEAR_EDGES)), look.noise)
-    fits, edged = beside_edges(look.film, fits, look.optics, look.noise, others)
+    fits, edged = beside_edges(look.film, fits, look.optics, look.noise, others, wanted=lambda some: look.sure(some, known))
     return fits.rows(edged & look.sure(fits, known))
 
 
 def _at_rims(look: _Look, rough: BallFits, known: BallFits) -> BallFits:
     """Balls half out of something as dense as they are: of its rim a surface leaves so much that only a fit with the edge can tell."""
     rough = distinct(rough.rows(~_near(rough.position_px, known, look.usual)), look.noise)
-    fits, edged = beside_edges(look.film, rough, look.optics, look.noise, look.beside(known))
     clear = np.abs(known.depth[look_clear(known, look.noise)])
-    deep = np.abs(fits.depth) > _DEEP * np.median(clear) if len(clear) else np.zeros(len(fits.depth), bool)
-    return distinct(fits.rows(edged & deep & look.may_be(fits, known) & look.sure(fits, known)), look.noise)
+    least = _DEEP * np.median(clear) if len(clear) else np.inf
+
+    def wanted(fits: BallFits) -> Bool:
+        return np.asarray((np.abs(fits.depth) > least) & look.may_be(fits, known) & look.sure(fits, known))
+
+    fits, edged = beside_edges(look.film, rough, look.optics, look.noise, look.beside(known), wanted=wanted)
+    return distinct(fits.rows(edged & wanted(fits)), look.noise)
 
 
 def _under_scratches(look: _Look, rough: BallFits, known: BallFits) -> BallFits:

@@ -78,8 +78,10 @@ def table_of(
         Squared errors by their surroundings, as :func:`rsa_vision.detect.marks.settle.settle` tells.
     added : ndarray of shape (n + m, 2, 2)
         Covariances of balls and tees, px^2, that no noise multiplies.
-    touching, poor_ball, doubtful : ndarray of bool, shape (n,)
-        Balls with something as dense beside them; that the model does not describe; that may belong to the texture of the film.
+    touching : ndarray of bool, shape (n + m,)
+        Balls with something as dense beside them, and needles of which one hides a part.
+    poor_ball, doubtful : ndarray of bool, shape (n,)
+        Balls that the model does not describe; that may belong to the texture of the film.
     tees : list of NeedleFit
         And pins.
     junctions : ndarray of shape (k, 5)
@@ -119,7 +121,7 @@ def table_of(
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[n:][[_noise_is_cut_off(t, noise) for t in tees]] |= MarkerFlag.SATURATED | MarkerFlag.CLIPPED
-    flags[:n][touching] |= MarkerFlag.OVERLAP
+    flags[touching] |= MarkerFlag.OVERLAP
     arms = np.array([len(t.angles) for t in tees])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), NEEDLES_ALIKE)

@@ -55,6 +55,10 @@ class Painted:
             total[inside] += self.images[k, row[inside], col[inside]]
         return total
 
+    def and_more(self, needles: list[tuple[NeedleFit, Optics]]) -> Painted:
+        """Return these and others, each with its optics."""
+        return paint([*zip(self.needles, self.optics, strict=True), *needles])
+
     def sharp(self, cols: Float, rows: Float) -> Float:
         """Return what they would show at these places (c,), (r,) on a film that is linear and hardly blurs, shape (r, c)."""
         total = np.zeros((len(rows), len(cols)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,10 @@ from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.needles import Images, NeedleFit, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, PROMISING, between, explains, scored, step_of
-from rsa_vision.types import Float, Int
+from rsa_vision.types import Bool, Float, Int
+
+Unseen = Callable[[Float, Float], Bool]
+"""Says at which pixels (cols, rows) something lies over needles that hides them."""
 
 _STEPS, _QUICK_STEPS = 16, 5
 _CONVERGED_PX = 0.02  # a step's change: what is left after it is a tenth of that, and the last fit follows
@@ -97,8 +100,9 @@ def window_of(
     noise: NoiseModel,
     others: Images | None,
     around_px: float = _AROUND_PX,
+    unseen: Unseen | None = None,
 ) -> Window:
-    """Cut out the pixels around the arms of some needles, the images of others taken away."""
+    """Cut out the pixels around the arms of some needles, less those that are not to be seen, the images of others taken away."""
     middle = np.mean([f.position_px for f in needles], axis=0)
     spread = max(float(np.abs(f.position_px - middle).max()) for f in needles)
     half = int(np.ceil(spread + max(f.shape.length_px * 1.15 + f.shape.half_width_px for f in needles) + 3 * optics.sigma_px + 3))
@@ -111,6 +115,9 @@ def window_of(
         dx, dy = (axis + (first - at) for first, at in zip(corner, f.position_px, strict=True))
         near |= support(dx, dy, f.angles, f.shape, 3 * optics.sigma_px + around_px)
     rows, cols = np.nonzero(near & patch.valid[0])
+    if unseen is not None:
+        seen = ~unseen(cols + corner[0], rows + corner[1])
+        rows, cols = rows[seen], cols[seen]
     raw = patch.values[0][rows, cols]
     first, box = int(cols.min(initial=patch.size)), (int(np.ptp(rows)) + 1, int(np.ptp(cols)) + 1)
     place = (rows - rows[0]) * box[1] + cols - first
@@ -138,6 +145,7 @@ def fit_crossing(
     *,
     others: Images | None = None,
     steps: int = _STEPS,
+    unseen: Unseen | None = None,
     quick: bool = False,
     edge: bool = False,
 ) -> list[NeedleFit]:
@@ -152,6 +160,8 @@ def fit_crossing(
     noise : NoiseModel
     others : callable, optional
         Images of neighbours, which are subtracted first.
+    unseen : callable, optional
+        Pixels that are left out.
     steps : int
         At the most.
     quick : bool
@@ -165,7 +175,7 @@ def fit_crossing(
         In the order of the starts, with the covariances of these; figures of merit are taken under each needle's own arms.
     """
     now = list(needles)
-    window = window_of(film, now, optics, noise, others, _CLOSE_PX if quick else _AROUND_PX)
+    window = window_of(film, now, optics, noise, others, _CLOSE_PX if quick else _AROUND_PX, unseen)
     steps, near = (min(steps, _QUICK_STEPS), _NEAR_PX) if quick else (steps, _CONVERGED_PX)
     cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.half
     weight = 1.0 / noise.variance_at(data + window.beside)

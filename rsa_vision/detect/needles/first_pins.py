@@ -14,7 +14,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import explains, fit_needles, unfit
-from rsa_vision.detect.needles.laid_over import laid_over
+from rsa_vision.detect.needles.laid_over import LIKENESS, laid_over
 from rsa_vision.detect.needles.pointed import STANDS_OUT_ROUGHLY, same_body, turned, unexplained
 from rsa_vision.detect.needles.sets import NEAREST_PX, TAPERS, on_arms
 from rsa_vision.types import Float
@@ -27,7 +27,6 @@ _AGAIN = 0.3  # part of a stroke's length within which another is the same
 _CLOSE_FIT = 0.03  # misfit and what is not explained, of a pin whose taper is right
 _WIDTHS_PX, _RATIOS = (1.5, 2.5, 4.0, 6.0), (9.0, 15.0)  # half widths that are laid over a film, and lengths over them
 _MOST_PLACES, _MOST_FOUND = 1000, 40
-_LIKENESS = 0.5  # correlation coefficient from which a place is worth a fit
 
 
 def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list[NeedleFit]:
@@ -90,7 +89,7 @@ def likest_pins(film: NDArray[Any], places: Float, sign: int, noise: NoiseModel)
     pins = [replace(unfit(np.zeros(2), np.zeros(1), shape), depths=np.array([float(sign)])) for shape in shapes]
     out: list[NeedleFit] = []
     for start in laid_over(film, places[:_MOST_PLACES], pins, _GUESS):
-        if start.likeness < _LIKENESS or len(out) == _MOST_FOUND:
+        if start.likeness < LIKENESS or len(out) == _MOST_FOUND:
             break
         if on_arms(start.place[None], out).any():
             continue

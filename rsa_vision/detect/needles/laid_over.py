@@ -19,6 +19,7 @@ from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float, Int
 
+LIKENESS = 0.5  # correlation coefficient from which a place is worth a fit
 _AT = (0.45, 0.65, 0.85)  # of the length from the tip, where a pin may answer the search most
 _DIRECTIONS = np.linspace(0, 2 * np.pi, 24, endpoint=False).tolist()  # of which each quarter is the first, turned
 _SCALE = 2  # films are compared at half resolution

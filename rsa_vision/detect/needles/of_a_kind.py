@@ -17,7 +17,7 @@ from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import fit_crossing
 from rsa_vision.detect.needles.fits import explains, fit_needles
-from rsa_vision.detect.needles.laid_over import laid_over
+from rsa_vision.detect.needles.laid_over import LIKENESS, laid_over
 from rsa_vision.detect.needles.pointed import (
     LEAST_OF_A_KIND,
     RATHER_THAN_TURNED,
@@ -61,16 +61,9 @@ def others_like(film: NDArray[Any], known: list[NeedleFit], places: Float, optic
     list of NeedleFit
         None of the known ones; none at all if these are not of a kind.
     """
-    clear = [f for f in known if is_pin(f, noise)]
-    if not are_of_a_kind(clear):
+    typical = typical_of(known, noise)
+    if typical is None:
         return []
-    width, length = np.exp(np.median(_log_sizes(clear), axis=0)).tolist()
-    typical = replace(
-        clear[0],
-        shape=replace(clear[0].shape, half_width_px=width, length_px=length),
-        depth=float(np.median([f.depth for f in clear])),
-        background=float(np.median([f.background for f in clear])),
-    )
     out: list[NeedleFit] = []
     in_vain = 0
     for start in laid_over(film, places, [typical], optics):
@@ -82,6 +75,64 @@ def others_like(film: NDArray[Any], known: list[NeedleFit], places: Float, optic
         found = _fit_like(film, start.pin, optics, noise)
         if found and _is_like(film, found, typical, optics, noise) and not any(same_body(found, k) for k in (*known, *out)):
             out.append(found)
+            in_vain = 0
+    return out
+
+
+def typical_of(known: list[NeedleFit], noise: NoiseModel) -> NeedleFit | None:
+    """Return a pin of the size and depth of a film's clear ones; None if these are not of a kind."""
+    clear = [f for f in known if is_pin(f, noise)]
+    if not are_of_a_kind(clear):
+        return None
+    width, length = np.exp(np.median(_log_sizes(clear), axis=0)).tolist()
+    return replace(
+        clear[0],
+        shape=replace(clear[0].shape, half_width_px=width, length_px=length),
+        depth=float(np.median([f.depth for f in clear])),
+        background=float(np.median([f.background for f in clear])),
+    )
+
+
+def starts_like(
+    film: NDArray[Any],
+    bare: NDArray[Any],
+    typical: NeedleFit,
+    places: Float,
+    known: list[NeedleFit],
+    optics: Optics,
+    noise: NoiseModel,
+) -> list[NeedleFit]:
+    """Find where something looks like a typical pin of the film, whatever else may lie there.
+
+    Parameters
+    ----------
+    film, bare : ndarray of shape (rows, cols)
+        Where they are sought, and fitted: NaN where they are hidden.
+    typical : NeedleFit
+        As of :func:`typical_of`.
+    places : ndarray of shape (n, 2)
+        On such pins, (col, row).
+    known : list of NeedleFit
+        Nothing is looked for on these.
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    list of NeedleFit
+        Of the typical size, likest first.
+    """
+    out: list[NeedleFit] = []
+    in_vain = 0
+    for start in laid_over(film, places, [typical], optics):
+        if start.likeness < LIKENESS or in_vain == _MOST_IN_VAIN:
+            break
+        if on_arms(start.place[None], [*known, *out]).any():
+            continue
+        fit = fit_needles(bare, start.pin.position_px, start.pin.angles, typical.shape, optics, noise, quick=True, sized=True)
+        in_vain += 1
+        if fit.depth * typical.depth > 0 and fit.significance > _ROUGHLY * SIGNIFICANT and explains(fit, _ROUGHLY):
+            out.append(fit)
             in_vain = 0
     return out
 
@@ -103,14 +154,18 @@ def _fit_like(film: NDArray[Any], typical: NeedleFit, optics: Optics, noise: Noi
 
 
 def _is_like(film: NDArray[Any], fit: NeedleFit, typical: NeedleFit, optics: Optics, noise: NoiseModel) -> bool:
-    """Say whether a fit is a pin of the typical size and as deep, or of as large a part of what is there."""
+    """Say whether a fit is of the typical kind, and no rod."""
+    return is_of_kind(fit, typical, noise) and (fit.edged or surer_than_rod(film, fit, optics, noise) > -_ODD)
+
+
+def is_of_kind(fit: NeedleFit, typical: NeedleFit, noise: NoiseModel) -> bool:
+    """Say whether a fit looks like a pin of the typical size and is as deep, or of as large a part of what is there."""
     deep = fit.depth / typical.depth
     of_background = deep * max(typical.background, 1.0) / max(fit.background, 1.0)
     return bool(
         is_pin(fit, noise, STANDS_OUT_ROUGHLY)
         and (np.abs(np.diff(_log_sizes([fit, typical]), axis=0)) < _ALIKE).all()
         and any(_PALE < ratio < 1 / _PALE for ratio in (deep, of_background))
-        and (fit.edged or surer_than_rod(film, fit, optics, noise) > -_ODD)
     )
 
 

@@ -14,6 +14,7 @@ from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
 from rsa_vision.detect.needles.first_pins import best_tapered, distinct, likest_pins
 from rsa_vision.detect.needles.fits import excess_of, fit_needles, significant_misfit
@@ -117,8 +118,7 @@ def _found_from(
     pins = [min(ways, key=unexplained) for ways in fits]
     pins = pointed(film, distinct(_still(pins, noise)), optics, noise)
     pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
-    # what pins have told of the film curve does not count twice: only their blur is where they begin
-    start = replace(optics, curve=known.curve, tail=known.tail, mu_px=known.mu_px)
+    start = _without_what_they_told(optics, known)
     pins, optics = fit_shared(film, pins, start, noise, parallel=False, alike=True)
     if more := others_like(film, pins, places, optics, noise):
         pins = _still(fit_all(film, [*pins, *more], optics, noise, again=MOST_TOGETHER), noise)
@@ -126,10 +126,49 @@ def _found_from(
     if not tees:  # beside those a pin may be what is seen of one, and says so
         pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
         pins = [f for f, alone in zip(pins, without_company(pins), strict=True) if not alone or shows_its_form(f, noise)]
-    pins = [f for f in pins if points_one_way(film, f, others_beside(f, [o for o in pins if o is not f], optics), optics, noise)]
+    return _stated(film, pins, sign, optics, noise, None), optics
+
+
+def fit_beside_balls(
+    film: NDArray[Any], pins: list[NeedleFit], balls: BallsBeside, known: Optics, optics: Optics, noise: NoiseModel
+) -> tuple[list[NeedleFit], Optics]:
+    """Fit all pins of a film once more, with the balls beside them and on them.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    pins : list of NeedleFit
+    balls : BallsBeside
+    known, optics : Optics
+        Of the film, and as pins have told them.
+    noise : NoiseModel
+
+    Returns
+    -------
+    pins : list of NeedleFit
+    optics : Optics
+    """
+    fitted, optics = fit_shared(film, pins, _without_what_they_told(optics, known), noise, parallel=False, alike=True, balls=balls)
+    return _stated(film, fitted, int(np.sign(pins[0].depth)), optics, noise, balls), optics
+
+
+def _without_what_they_told(optics: Optics, known: Optics) -> Optics:
+    """Return where a fit of all pins begins: at their blur; what they have told of the film curve does not count twice."""
+    return replace(optics, curve=known.curve, tail=known.tail, mu_px=known.mu_px)
+
+
+def _stated(
+    film: NDArray[Any], pins: list[NeedleFit], sign: int, optics: Optics, noise: NoiseModel, balls: BallsBeside | None
+) -> list[NeedleFit]:
+    """Keep what still looks like a pin once all are fitted, and state its errors."""
+    others = [others_beside(f, [o for o in pins if o is not f], optics) for f in pins]
+    if balls:
+        others = [balls.and_others(o) for o in others]
+    unseen = balls.over if balls else None
+    pins = [f for f, beside in zip(pins, others, strict=True) if points_one_way(film, f, beside, optics, noise, unseen)]
     pins = [f for f in _still(pins, noise) if np.sign(f.depth) == sign]  # a fit among others may end up as the gap between them
     typical = float(np.median([f.depth for f in pins])) if pins else 0.0
-    return [_less_sure_along(f, typical, odd, optics, noise) for f, odd in zip(pins, odd_lengths(pins), strict=True)], optics
+    return [_less_sure_along(f, typical, odd, optics, noise) for f, odd in zip(pins, odd_lengths(pins), strict=True)]
 
 
 def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:

@@ -13,7 +13,7 @@ from rsa_vision.detect.balls.find import MISFIT
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import Images, NeedleFit
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.crossing import chi2_of, fit_crossing, window_of
+from rsa_vision.detect.needles.crossing import Unseen, chi2_of, fit_crossing, window_of
 from rsa_vision.detect.needles.fits import STANDS_OUT, explains, fit_needles, significant_misfit
 from rsa_vision.types import Float
 
@@ -93,7 +93,9 @@ def shows_its_form(pin: NeedleFit, noise: NoiseModel) -> bool:
     return pin.height > _ALONE * shorter * float(np.sqrt(noise.variance_at(np.array(pin.background))))
 
 
-def points_one_way(film: NDArray[Any], fit: NeedleFit, others: Images | None, optics: Optics, noise: NoiseModel) -> bool:
+def points_one_way(
+    film: NDArray[Any], fit: NeedleFit, others: Images | None, optics: Optics, noise: NoiseModel, unseen: Unseen | None = None
+) -> bool:
     """Say whether the same pin the other way round leaves more than noise, and what the fit leaves itself, let it.
 
     Parameters
@@ -105,14 +107,15 @@ def points_one_way(film: NDArray[Any], fit: NeedleFit, others: Images | None, op
     optics : Optics
         With how depths go with the background: where that is dark either end fades out.
     noise : NoiseModel
+    unseen : callable, optional
+        Pixels that are left out.
 
     Returns
     -------
     bool
     """
-    tip, angles = turned(fit)
-    both = [fit, replace(fit, position_px=tip, angles=angles)]
-    left, more = (fit_crossing(film, [f], optics, noise, others=others, edge=fit.edged)[0].chi2_core for f in both)
+    both = either_way(fit)
+    left, more = (fit_crossing(film, [f], optics, noise, others=others, unseen=unseen, edge=fit.edged)[0].chi2_core for f in both)
     return bool(more - left > 2 * _ONE_WAY * max(left, 1.0) / fit.n_core + _OF_LEFT * max(left - 1.0, 0.0))
 
 
@@ -120,6 +123,12 @@ def turned(fit: NeedleFit) -> tuple[Float, Float]:
     """Tip and direction of the same pin the other way round."""
     way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
     return fit.position_px + fit.shape.length_px * way, fit.angles + np.pi
+
+
+def either_way(fit: NeedleFit) -> list[NeedleFit]:
+    """Return a pin, and the same the other way round."""
+    tip, angles = turned(fit)
+    return [fit, replace(fit, position_px=tip, angles=angles)]
 
 
 def surer_than_rod(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:

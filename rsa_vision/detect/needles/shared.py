@@ -19,6 +19,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import Window, window_of
 from rsa_vision.detect.needles.differing import MOST_BLURRIER, MOST_TAPER, Differing, differing, equal
 from rsa_vision.detect.needles.disturbed import louder
@@ -90,6 +91,7 @@ def fit_shared(
     *,
     parallel: bool,
     alike: bool = False,
+    balls: BallsBeside | None = None,
     steps: int = _STEPS,
 ) -> tuple[list[NeedleFit], Optics]:
     """Fit all needles of a film and their common attenuation, blur and directions.
@@ -108,6 +110,8 @@ def fit_shared(
         Their sizes differ as little as fits with free sizes show: for pins, whose tips depend on where they end. Three of them or more tell
         what comes after the film curve as well, which moves no tip that three arms hold; before it is known that there are pins, rods may
         be bent into them.
+    balls : BallsBeside, optional
+        Beside them and on them.
     steps : int
         At the most.
 
@@ -122,7 +126,11 @@ def fit_shared(
     parallel = parallel and len(needles[0].angles) > 1
     taper = float(np.median([f.shape.taper for f in needles]))
     sets = clusters([replace(f, shape=replace(f.shape, taper=taper)) for f in needles])
-    windows = [window_of(film, m, optics, noise, others) for m, others in zip(sets, beside_each(sets, optics), strict=True)]
+    others = beside_each(sets, optics)
+    if balls:
+        others = [balls.and_others(o) for o in others]
+    unseen = balls.over if balls else None
+    windows = [window_of(film, m, optics, noise, beside, unseen=unseen) for m, beside in zip(sets, others, strict=True)]
     windows = [w.with_edge(m, optics) if any(f.edged for f in m) else w for w, m in zip(windows, sets, strict=True)]
     of_blur = _UNEVEN_ERROR if any(optics.uneven) else _EVEN_ERROR
     scanned = alike and len(needles) >= _ENOUGH_PINS

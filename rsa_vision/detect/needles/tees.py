@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,9 @@ from rsa_vision.detect.needles.templates import SCALE, find_like, promising, tem
 from rsa_vision.detect.needles.twins import split_twins
 from rsa_vision.detect.search.junctions import ALONE, RINGS_PX
 from rsa_vision.types import Float
+
+AtJunction = Callable[..., NeedleFit | None]
+"""Fits a tee of some taper at a junction, col, row, angle, ring and strength; None where nothing may be one."""
 
 _BEFORE = 1.5  # tolerance before attenuation and ends are fitted
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
@@ -74,10 +78,11 @@ def find_tees(
         With the attenuation that suits the arms: they are thinner than balls, and the film curve is bent.
     """
     strong = np.abs(junctions[:, 4]) > ALONE
-    found = _found_from(film, junctions[strong], strokes, optics, noise)
+    fitted_at = cache(partial(_at_junction, film, optics, noise))  # the strong ones are among all
+    found = _found_from(film, junctions[strong], fitted_at, strokes, optics, noise)
     if found[0] or strong.all():
         return found
-    weak = _found_from(film, junctions, strokes, optics, noise)
+    weak = _found_from(film, junctions, fitted_at, strokes, optics, noise)
     return weak if _is_a_set([t for t in weak[0] if is_tee(t)]) else found
 
 
@@ -93,9 +98,9 @@ def _is_a_set(tees: list[NeedleFit]) -> bool:
 
 
 def _found_from(
-    film: NDArray[Any], junctions: Float, strokes: Float, optics: Optics, noise: NoiseModel
+    film: NDArray[Any], junctions: Float, fitted_at: AtJunction, strokes: Float, optics: Optics, noise: NoiseModel
 ) -> tuple[list[NeedleFit], list[NeedleFit], Optics]:
-    models, turned = _models(film, junctions, optics, noise)
+    models, turned = _models(junctions, fitted_at)
     if not models:
         return [], [], optics
     tees = _like(film, models, turned, optics, noise)
@@ -179,7 +184,7 @@ def first_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> list[
         The few cleanest of what may be tees.
     """
     strongest = junctions[np.argsort(-np.abs(junctions[:, 4]))][:_MOST_JUNCTIONS]
-    return _at_junctions(film, strongest, TAPERS[0], GUESS, noise)[:_ASKED]
+    return _at_junctions(strongest, TAPERS[0], partial(_at_junction, film, GUESS, noise))[:_ASKED]
 
 
 def optics_of_tees(film: NDArray[Any], cleanest: list[NeedleFit], noise: NoiseModel) -> tuple[Optics, float]:
@@ -220,13 +225,13 @@ def is_tee(fit: NeedleFit, slack: float = 1.0) -> bool:
     return bool(square and slim and fit.misfit < 1.3 * MISFIT * slack and explains(fit, 1 - (1 - EXPLAINED) * slack))
 
 
-def _models(film: NDArray[Any], junctions: Float, optics: Optics, noise: NoiseModel) -> tuple[list[NeedleFit], list[NeedleFit]]:
+def _models(junctions: Float, fitted_at: AtJunction) -> tuple[list[NeedleFit], list[NeedleFit]]:
     """Fit tees at the strongest junctions until a few are clean; the cleanest first, one of each size, and those turned against it."""
     order = junctions[np.argsort(-np.abs(junctions[:, 4]))][:_MOST_JUNCTIONS]
     rough: list[NeedleFit] = []
     best_taper = TAPERS[0]
     for taper in TAPERS:  # full cones first; pins with a short point leave more than cones do
-        tried = _at_junctions(film, order, taper, optics, noise)
+        tried = _at_junctions(order, taper, fitted_at)
         if _mean_misfit(tried) < 0.8 * _mean_misfit(rough):
             rough, best_taper = tried, taper
         if not rough or _mean_misfit(rough) < CLEAN:
@@ -252,23 +257,31 @@ def _turned(fit: NeedleFit, model: NeedleFit) -> bool:
     return abs(math.remainder(fit.angles[0] - model.angles[0], math.tau)) > _TURNED
 
 
-def _at_junctions(film: NDArray[Any], junctions: Float, taper: float, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+def _at_junctions(junctions: Float, taper: float, fitted_at: AtJunction) -> list[NeedleFit]:
     """Fit a tee at each junction until enough are clean; best first."""
     rough: list[NeedleFit] = []
-    for col, row, angle, ring, strength in junctions:
-        start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
-        tried: list[NeedleFit] = []
-        for turn in (0.0, _ASIDE, -_ASIDE):
-            angles = angle + turn + np.array([0.0, np.pi / 2, -np.pi / 2])
-            tried.append(fit_needles(film, np.array([col, row]), angles, start, optics, noise))
-            if is_tee(tried[-1]) or tried[0].explained < _ASKEW:
-                break
-        like = (f for f in tried if is_tee(f, slack=ROUGH) and f.depth * strength < 0)  # the answer has the other sign
-        rough += sorted(like, key=_left)[:1]
+    for junction in junctions.tolist():
+        fit = fitted_at(taper, *junction)
+        rough += [fit] if fit else []
         clean = [f for f in rough if is_tee(f)]
         if len(clean) >= ENOUGH and not any(_turned(f, clean[0]) for f in clean):
             break
     return sorted(rough, key=_left)
+
+
+def _at_junction(
+    film: NDArray[Any], optics: Optics, noise: NoiseModel, taper: float, col: float, row: float, angle: float, ring: float, strength: float
+) -> NeedleFit | None:
+    """Fit a tee at a junction, or aside from where that points, and return the best that may be one."""
+    start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
+    tried: list[NeedleFit] = []
+    for turn in (0.0, _ASIDE, -_ASIDE):
+        angles = angle + turn + np.array([0.0, np.pi / 2, -np.pi / 2])
+        tried.append(fit_needles(film, np.array([col, row]), angles, start, optics, noise))
+        if is_tee(tried[-1]) or tried[0].explained < _ASKEW:
+            break
+    like = (f for f in tried if is_tee(f, slack=ROUGH) and f.depth * strength < 0)  # the answer has the other sign
+    return min(like, key=_left, default=None)
 
 
 def _left(fit: NeedleFit) -> float:

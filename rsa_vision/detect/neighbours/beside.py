@@ -51,7 +51,7 @@ def images_beside(known: BallFits, members: Int, optics: Optics, tees: Backgroun
     total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
     doubtful: Bool = np.zeros(cols.shape, np.bool_)
     reach = known.radius_px + 4 * optics.sigma_px
-    low, high = (np.array([cols.flat[k], rows.flat[k]]) for k in (0, -1))
+    low, high = (np.array([end(cols), end(rows)]) for end in (np.min, np.max))
     near = np.array(((known.position_px > low - reach[:, None]) & (known.position_px < high + reach[:, None])).all(1))
     near[members] = False
     for j in np.nonzero(near)[0]:
@@ -60,6 +60,17 @@ def images_beside(known: BallFits, members: Int, optics: Optics, tees: Backgroun
         total = total + known.depth[j] * image.reshape(cols.shape)
         doubtful = doubtful | (np.hypot(dx, dy) < known.radius_px[j] + optics.sigma_px)
     return total, doubtful
+
+
+def without_balls(film: NDArray[Any], balls: BallFits, optics: Optics) -> NDArray[np.float32]:
+    """Return the film without the images of balls."""
+    out = film.astype(np.float32)
+    for at, radius, depth in zip(balls.position_px, balls.radius_px, balls.depth, strict=True):
+        reach = radius + 4 * optics.sigma_px
+        (left, top), (right, bottom) = (np.clip(np.rint(at + step), 0, film.shape[::-1]).astype(np.intp) for step in (-reach, reach + 1))
+        dx, dy = np.meshgrid(np.arange(left, right) - at[0], np.arange(top, bottom) - at[1])
+        out[top:bottom, left:right] -= depth * ball_image(dx[None], dy[None], np.array([radius]), optics.sigma_px, optics.mu_px)[0]
+    return out
 
 
 def deep_at(film: NDArray[Any], peaks: Float, radius: float, tees: Background | None) -> Float:

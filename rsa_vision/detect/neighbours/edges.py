@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -30,7 +31,14 @@ _MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: eac
 
 
 def beside_edges(
-    film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None, spot: Spot | None = None
+    film: NDArray[Any],
+    fits: BallFits,
+    optics: Optics,
+    noise: NoiseModel,
+    tees: Background | None,
+    spot: Spot | None = None,
+    *,
+    wanted: Callable[[BallFits], Bool] | None = None,
 ) -> tuple[BallFits, Bool]:
     """Fit again, with an edge in the background, the balls that lie on or beside one (the likelihood tells); say which they are.
 
@@ -48,6 +56,8 @@ def beside_edges(
         Images to be taken away first.
     spot : Spot, optional
         That draws the balls, if it is no Gaussian.
+    wanted : callable, optional
+        Says what is asked for of those that are fitted with an edge: whether others lie at one is not told.
 
     Returns
     -------
@@ -72,7 +82,7 @@ def beside_edges(
             parts.append(plain)
             continue
         fitted = partial(fit_group, film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, spot=spot)
-        flat, straight = fitted(), fitted(edge=True)
+        straight = fitted(edge=True)
         models = [(0.0 if straight.converged.all() else -np.inf, straight)]
         for taken, bent in ((True, False), (False, True), (True, True)):
             if taken and bent and len(models) > 1 and max(models, key=lambda model: model[0]) is models[0]:
@@ -82,12 +92,16 @@ def beside_edges(
                 models.append((_gain(other, straight, noise) - _MORE_GAIN * (taken + bent), other))
         best, edged = max(models, key=lambda model: model[0])
         lost = plausible(plain, noise) & ~plausible(edged, noise)
+        if not edged.converged.all() or lost.any() or (wanted and not wanted(edged).any()):
+            parts.append(plain)
+            continue
+        flat = fitted()
         if len(g) == 1 and plain.significance[0] > _CLEAR and _gain(edged, flat, noise) >= EDGE_GAIN:
             blurred = (fitted(blurrier=b) for b in _BLURRIER)
             # what film curves leave, no blur takes away
             told = [b for b in blurred if b.converged.all() and b.chi2_core[0] < _EXPLAINED * flat.chi2_core[0]]
             flat = max([flat, *told], key=lambda one: float(one.log_likelihood[0]))
-        if _gain(edged, flat, noise) < EDGE_GAIN or not edged.converged.all() or lost.any():
+        if _gain(edged, flat, noise) < EDGE_GAIN:
             parts.append(plain)
             continue
         covariance = edged.covariance.copy()
