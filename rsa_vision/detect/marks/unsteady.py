@@ -25,7 +25,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.beside import Background, images_beside
 from rsa_vision.types import Bool, Float, Int
 
-_ASKED, _LEAST, _PLACES = 36, 6, 100  # marks that tell; free places of one size
+_ASKED, _LEAST, _PLACES = 36, 6, 100  # balls that tell; free places of one size
 _SLOPING = 0.1  # of the information that the line with most has, from which one tells where it is
 _OUTLIER = 4.0  # times the median of what lines of marks leave
 _BY_CHANCE = 4.5  # standard deviations
@@ -125,13 +125,12 @@ def unsteady_lines(marks: Marks, clear: Int, places: list[Places]) -> Unsteady |
     Returns
     -------
     Unsteady or None
-        None where lines are steady, or too few marks tell.
+        None where lines are steady, or too few balls tell: arms of needles are not alike along both axes, nor is what fits leave of them.
     """
-    n = len(marks.balls.depth)
-    asked = [*clear.tolist(), *range(n, n + len(marks.needles))]
-    if len(asked) < _LEAST:
+    if len(clear) < _LEAST:
         return None
-    windows = list(marks.windows(asked[:: 1 + (len(asked) - 1) // _ASKED]))  # of all: the first are those that the model describes best
+    # of all: the first are those that the model describes best
+    windows = list(marks.windows(clear[:: 1 + (len(clear) - 1) // _ASKED].tolist()))
     free = {2 * these.half + 1: these.values[:: 1 + len(these.values) // _PLACES] for these in places if len(these.values)}
     found = [of for of in (_displaced(windows, way, free) for way in (0, 1)) if of]
     return Unsteady(tuple(of for of, _ in found), min(noise for _, noise in found)) if found else None
@@ -177,7 +176,7 @@ def _displaced(windows: list[_Window], way: int, free: dict[int, NDArray[Any]]) 
     more, less = int(np.argmax(of_each)), int(np.argmin(of_each))
     if of_each[more] < (1 + by_chance) * of_each[less]:
         return None
-    beside = _at_free_places(windows, kinds, free)
+    beside = _at_free_places([window for window, kept in zip(windows, keep, strict=True) if kept], kinds, free)
     of_noise = float(of_each[less] * beside[more] / beside[less])
     if of_each[more] < (1 + by_chance) * of_noise:
         return None
@@ -192,7 +191,8 @@ def _at_free_places(windows: list[_Window], kinds: tuple[tuple[int, int], ...], 
     if not left:
         return np.ones(len(kinds))
     told = [[window.told_by(*kind, of) for window, of in left] for kind in kinds]
-    return np.array([np.mean([(off**2 / chance).mean() for off, chance in of]) for of in told])
+    square = np.array([sum((off**2 / chance).sum() for off, chance in of) for of in told])
+    return np.asarray(square / [sum(off.size for off, _ in of) for of in told])
 
 
 def _of_ball(marks: Marks, i: int) -> _Window:
