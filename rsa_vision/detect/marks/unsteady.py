@@ -177,6 +177,8 @@ def _displaced(windows: list[_Window], way: int, free: dict[int, NDArray[Any]]) 
     if of_each[more] < (1 + by_chance) * of_each[less]:
         return None
     beside = _at_free_places([window for window, kept in zip(windows, keep, strict=True) if kept], kinds, free)
+    if not beside.all():  # no noise at all
+        return None
     of_noise = float(of_each[less] * beside[more] / beside[less])
     if of_each[more] < (1 + by_chance) * of_noise:
         return None
