@@ -315,7 +315,9 @@ def _by_lines(marks: Marks, clear: Int, places: list[Places], under: float) -> t
     lines = unsteady_lines(marks, clear, places)
     if lines is None:
         return marks.balls, np.zeros((len(marks.balls.depth) + len(marks.needles), 2, 2))
-    return replace(marks.balls, covariance=min(lines.noise / under, 1.0) * marks.balls.covariance), by_lines(lines, marks)
+    # of noise that neighbours share there is less in the differences of lines than its variance
+    less = min(lines.noise / under, 1.0) if marks.noise.is_white else 1.0
+    return replace(marks.balls, covariance=less * marks.balls.covariance), by_lines(lines, marks)
 
 
 def _undisturbed(found: Balls, optics: Optics) -> list[Int]:
