@@ -79,9 +79,10 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
         return Detection(MarkerImages.empty(), True, Optics(1.0, 0.5), noise)
     images = [detection.images for _, detection in found]
     which, contested = likelier(images, [evidence for evidence, _ in found])
-    chosen = of_doubtful_polarity(images[which]) if contested else images[which]
+    chosen = found[which][1]
+    doubted = of_doubtful_polarity(chosen.images) if contested else chosen.images
     height = height_of_waves(values, noise.floor, noise.ceiling) / (2**bits - 1)
-    return replace(found[which][1], images=like_waves(chosen, height, found[which][1].optics))
+    return replace(chosen, images=like_waves(doubted, height, chosen.optics))
 
 
 def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, only: int | None = None) -> list[tuple[float, Detection]]:

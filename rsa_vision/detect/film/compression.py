@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
 
+from rsa_vision.detect.film.tiles import nowhere_saturated, tiles_of
 from rsa_vision.types import Float
 
 _SIDE = 8  # pixels of a block
@@ -89,11 +90,8 @@ def noise_of_compression(film: NDArray[Any], reach: int, floor: float = -np.inf,
 
 def _coefficients(film: NDArray[Any], most: int, floor: float, ceiling: float) -> Float:
     """Of blocks spread over the film that are nowhere saturated, shape (n, 8, 8)."""
-    n_rows, n_cols = film.shape[0] // _SIDE, film.shape[1] // _SIDE
-    step = max(1, int(np.ceil(np.sqrt(n_rows * n_cols / most))))
-    blocks = film[: n_rows * _SIDE, : n_cols * _SIDE].reshape(n_rows, _SIDE, n_cols, _SIDE)[::step, :, ::step].swapaxes(1, 2)
-    blocks = blocks.reshape(-1, _SIDE, _SIDE)
-    blocks = blocks[(blocks.min((1, 2)) > floor) & (blocks.max((1, 2)) < ceiling)].astype(np.float32)
+    blocks = tiles_of(film, _SIDE, most)
+    blocks = blocks[nowhere_saturated(blocks, floor, ceiling)].astype(np.float32)
     return np.asarray(_basis() @ blocks @ _basis().T, np.float64)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.types import Float
+from rsa_vision.types import Bool, Float
 
 ENOUGH_TILES = 12  # that are nowhere saturated
 MAX_TILES = 900  # spread over the film: more do not sharpen the estimate noticeably
@@ -21,7 +21,7 @@ _QUIET = 0.25  # of the tiles of a film, whose noise tells whether it has any
 def whole_tiles(film: NDArray[Any], side: int, floor: float, ceiling: float) -> NDArray[Any]:
     """Tiles that are nowhere saturated, shape (n, side, side)."""
     tiles = tiles_of(film, side)
-    whole = (tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)
+    whole = nowhere_saturated(tiles, floor, ceiling)
     # shutters and frames of one value, amid those of the film, are no film where that has noise; of film without noise, areas differ
     blank = whole & ((tiles[:, :, 1:] == tiles[:, :, :-1]).mean((1, 2)) > _BLANK)
     if blank.any():
@@ -33,10 +33,15 @@ def whole_tiles(film: NDArray[Any], side: int, floor: float, ceiling: float) -> 
     return np.asarray(tiles[whole])
 
 
-def tiles_of(film: NDArray[Any], side: int) -> NDArray[Any]:
-    """Tiles spread evenly over a film, shape (n, side, side)."""
+def nowhere_saturated(tiles: NDArray[Any], floor: float, ceiling: float) -> Bool:
+    """Say of which tiles (n, side, side) all values lie between these."""
+    return np.asarray((tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling))
+
+
+def tiles_of(film: NDArray[Any], side: int, most: int = MAX_TILES) -> NDArray[Any]:
+    """Tiles spread evenly over a film, about so many at the most, shape (n, side, side)."""
     n_rows, n_cols = film.shape[0] // side, film.shape[1] // side
-    step = max(1, int(np.ceil(np.sqrt(n_rows * n_cols / MAX_TILES))))
+    step = max(1, int(np.ceil(np.sqrt(n_rows * n_cols / most))))
     tiles = film[: n_rows * side, : n_cols * side].reshape(n_rows, side, n_cols, side)[::step, :, ::step].swapaxes(1, 2)
     return tiles.reshape(-1, side, side)
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.film.tiles import nowhere_saturated, tiles_of
 from rsa_vision.types import Float
 
 _LIFTING = (-1.586134342059924, -0.052980118572961, 0.882911075530934, 0.443506852043971)
@@ -63,11 +64,8 @@ def _step(band: Float) -> float:
 
 def _tiles(film: NDArray[Any], most: int, floor: float, ceiling: float) -> Float:
     """Tiles spread over the film that are nowhere saturated, shape (n, side, side)."""
-    n_rows, n_cols = film.shape[0] // _SIDE, film.shape[1] // _SIDE
-    step = max(1, int(np.ceil(np.sqrt(n_rows * n_cols / most))))
-    tiles = film[: n_rows * _SIDE, : n_cols * _SIDE].reshape(n_rows, _SIDE, n_cols, _SIDE)[::step, :, ::step].swapaxes(1, 2)
-    tiles = tiles.reshape(-1, _SIDE, _SIDE)
-    return np.asarray(tiles[(tiles.min((1, 2)) > floor) & (tiles.max((1, 2)) < ceiling)], np.float64)
+    tiles = tiles_of(film, _SIDE, most)
+    return np.asarray(tiles[nowhere_saturated(tiles, floor, ceiling)], np.float64)
 
 
 def _diagonal(tiles: Float, level: int) -> Float:

@@ -66,9 +66,9 @@ class _Window:
         chance = 1 / np.where(tells, told, np.inf)
         off = chance * (slope * self.weight * left).sum(along - 2)
         three = tells[:-2] & tells[1:-1] & tells[2:]
-        return (off[..., 1:-1] - 0.5 * (off[..., :-2] + off[..., 2:]))[..., three], (chance[1:-1] + 0.25 * (chance[:-2] + chance[2:]))[
-            three
-        ]
+        differ = off[..., 1:-1] - 0.5 * (off[..., :-2] + off[..., 2:])
+        variance = chance[1:-1] + 0.25 * (chance[:-2] + chance[2:])
+        return differ[..., three], variance[three]
 
     def beside(self, values: NDArray[Any]) -> Float:
         """Return what the fit would leave of free places (k, s * s), shape (k, s, s)."""
