@@ -103,8 +103,7 @@ def test_an_arm_of_which_the_rest_is_hidden_is_no_pin_without_a_flag() -> None:
     found = detect_markers(exposed(clear, rng), bits=16).images
     pins = found.rows(found.shape == "pin")
     near = np.hypot(*(pins.position_px[:, None] - tips[hidden]).transpose(2, 0, 1)).min(axis=1) < LENGTH_PX
-    assert near.any()
-    assert (pins.flags[near] & MarkerFlag.UNLIKE).all()
+    assert (pins.flags[near] & MarkerFlag.UNLIKE).all()  # or nothing is found there
     assert np.count_nonzero((found.shape == "tee") & (found.flags == 0)) == len(tips) - len(hidden)
 
 

@@ -135,9 +135,12 @@ def resolve_balls(
     for members in _unexplained_pairs(film, candidates, good, like, sized, optics, tees):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
         # one peak too many takes part of a ball, and then there is none
-        while sized and len(pair.depth) > 2 and not _like(pair, like).all() and np.count_nonzero(plausible(pair, noise)) > 1:
-            pair = pair.rows(np.arange(len(pair.depth)) != pair.significance.argmin())
-            pair = fit_group(film, pair.position_px, np.full(len(pair.depth), members[0, 2]), optics.sigma_px, optics.mu_px, noise, tees)
+        while sized and len(pair.depth) > 2 and not _like(pair, like).all():
+            others_px = pair.rows(np.arange(len(pair.depth)) != pair.significance.argmin()).position_px
+            fewer = fit_group(film, others_px, np.full(len(others_px), members[0, 2]), optics.sigma_px, optics.mu_px, noise, tees)
+            if np.count_nonzero(plausible(pair, noise)) < 2 and not (_like(fewer, like) & plausible(fewer, noise)).all():
+                break
+            pair = fewer
         if not _is_bar(pair, like, 2 * members[0, 2] + TOUCH * optics.sigma_px, noise):
             fits.append(pair.rows(_like(pair, like) & ~_cancelled(pair)))
     clean &= ~perhaps_two(single, single.rows(clean), noise)
@@ -169,10 +172,16 @@ def resolve_balls(
     if lone:
         known, alone = good.rows(there), (np.cumsum(there) - 1)[lone]
 
-        def neighbours(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
-            return images_beside(known, alone[[i]], optics, tees, cols, rows)
-
-        fits.append(fit_at(film, known.position_px[alone], known.radius_px[alone], optics, noise, neighbours))
+        fits.append(
+            fit_at(
+                film,
+                known.position_px[alone],
+                known.radius_px[alone],
+                optics,
+                noise,
+                lambda i, *at: images_beside(known, alone[[i]], optics, tees, *at),
+            )
+        )
     found = join([single.rows(slice(0)), *fits])
     found = found.rows(~_cancelled(found))
     found = found.rows(inside(found, film) & ~_taken(found, drawn.fits))
@@ -188,11 +197,10 @@ def resolve_balls(
     found, edged = found.rows(balls), edged[balls]
     of_spot, at_edge = _drawn_beside_edges(film, drawn, optics, noise, needles)
     n, every = len(found.depth), join([found, of_spot])
-    is_drawn = np.arange(len(every.depth)) >= n
+    is_drawn, none = np.arange(len(every.depth)) >= n, np.zeros(len(every.depth), bool)
     touching = np.append(np.zeros(n, bool), drawn.doubtful)
     for g in groups_of(every, optics):
         touching[g] |= len(g) > 1
-    none = np.zeros(len(every.depth), bool)
     edged = np.append(edged, at_edge)
     return Balls(every, touching, edged, none, is_drawn, np.concatenate([np.zeros((n, 2, 2)), drawn.by_spot]), drawn.spot)
 

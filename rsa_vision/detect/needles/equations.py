@@ -143,13 +143,6 @@ class Equations:
         each = own_parameters(len(self.members[0].angles), self.parallel)
         return np.add.outer(each * np.arange(len(self.members)), [0, 1]).ravel()
 
-    @property
-    def variance_of_sizes(self) -> Float:
-        """Variances of half widths and lengths, shape (members, 2)."""
-        each = own_parameters(len(self.members[0].angles), self.parallel)
-        at = np.add.outer(each * np.arange(len(self.members)), [2, 3])
-        return np.asarray(self.excess * self.inverse.diagonal()[at], np.float64)
-
     def surprise(self, change: Float, error_px: float) -> Float:
         """Squared standard deviations by which a change of the own parameters moves each tip (members,), this error added to its own."""
         at = self.tips.reshape(-1, 2)
@@ -172,8 +165,17 @@ class Equations:
         change, variance = self._free(np.array([own_parameters(1, self.parallel) - 1]))
         return np.array([f.shape.taper for f in self.members]) + change[:, 0], variance[:, 0]
 
+    def free_sizes(self) -> tuple[Float, Float]:
+        """Logarithms of half width and length of each were nothing expected of them, and the squares of the errors, shape (members, 2)."""
+        change, variance = self._free(np.array([2, 3]))
+        size = np.array([[f.shape.half_width_px, f.shape.length_px] for f in self.members])
+        return np.log(np.maximum(size + change, 0.5 * size)), variance / size**2
+
     def _free(self, which: Int) -> tuple[Float, Float]:
-        """Changes of these own parameters of each needle were nothing expected of them, and their variances, shape (members, k)."""
+        """Changes of these own parameters of each needle were nothing expected of them, and their variances, shape (members, k).
+
+        Of equations that are filtered, in which noise is white.
+        """
         each = own_parameters(len(self.members[0].angles), self.parallel)
         at = np.add.outer(each * np.arange(len(self.members)), which)
         prior = self.prior.copy()

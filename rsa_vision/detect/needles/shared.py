@@ -155,6 +155,7 @@ def fit_shared(
     last: list[Equations | None] = [None] * len(sets)
     before: tuple[State, list[Equations], Step] | None = None
     converged, restarted, shorter, least = False, False, 0, np.inf
+    through: Filter | None = None
     for count in range(steps + 3 * _MORE_STEPS + 1):
         optics = moved_optics(start, at.moved)
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or _far_apart(at, of_each):
@@ -188,9 +189,15 @@ def fit_shared(
             surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, step.own, strict=True)])
             converged = count > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
             converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
-            if (converged or count >= _BLURS_AFTER) and not asked_of_blurs:
+            ask_of_blurs = (converged or count >= _BLURS_AFTER) and not asked_of_blurs
+            ask_of_tapers = (converged or count >= _TAPERS_AFTER) and count >= sizes_at and not asked_of_tapers
+            ask = (converged or count >= _ASKED_AFTER) and not asked  # near enough to tell how far their arms differ
+            if ask_of_blurs or ask_of_tapers or ask:  # what needles differ by, and not what noise and bone under them make of that
+                through = through or _quietest(film, windows, systems, noise)
+                quiet = _filtered(windows, systems, through)
+            if ask_of_blurs:
                 asked_of_blurs = True
-                if differ := _blurs(systems, gain):
+                if differ := _blurs(quiet):
                     moved = at.moved.copy()  # a curve that made up for them leads astray
                     moved[BENT] = [-was for was in (*start.curve, start.tail, 0.0, start.logged, *start.uneven)]
                     at, converged, least, before = (
@@ -201,15 +208,15 @@ def fit_shared(
                     )
                     steps, sizes_at = steps + _MORE_STEPS, count + 1 + _SIZES_AFTER
                     continue
-            if (converged or count >= _TAPERS_AFTER) and count >= sizes_at and not asked_of_tapers:
+            if ask_of_tapers:
                 asked_of_tapers = True
-                if of_several_lengths(at.sizes) and (pointed := _tapers(systems, at, gain)):
+                if of_several_lengths(at.sizes) and (pointed := _tapers(quiet, at)):
                     at, converged, least, before = replace(at, sets=pointed[0], tapers=pointed[1]), False, np.inf, None
                     steps += _MORE_STEPS
                     continue
-            if (converged or count >= _ASKED_AFTER) and not asked:  # near enough to tell how far their arms differ
+            if ask:
                 asked = True
-                odd = _odd(systems, at, gain) if parallel else None
+                odd = _odd(quiet, at) if parallel else None
                 if uneven := _is_uneven(precision, normal - held, target, at.moved, gain):
                     precision[UNEVEN, UNEVEN] = _OF_UNEVEN
                     held = precision * gain
@@ -221,9 +228,10 @@ def fit_shared(
         before, last = (at, systems, step), [*systems]
         at = at.after(step, systems, parallel)
         if alike and count + 1 == sizes_at:
-            at, converged, least = replace(at, sizes=sizes_of(systems, at.sets)), False, np.inf
-    through = _quietest(film, windows, systems, noise)
-    systems = [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
+            through = through or _quietest(film, windows, systems, noise)
+            at, converged, least = replace(at, sizes=sizes_of(_filtered(windows, systems, through))), False, np.inf
+    through = through or _quietest(film, windows, systems, noise)
+    systems = _filtered(windows, systems, through)
     told = [e.information() for e in compress(systems, telling)]
     normal = precision + sum(matrix for matrix, _ in told)
     change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at, start)
@@ -253,12 +261,16 @@ def _telling(sets: list[list[NeedleFit]], noise: NoiseModel) -> list[bool]:
     return [bool(of < _SPOILT * typical) for of in left]
 
 
-def _odd(systems: list[Equations], at: State, gain: float) -> Regularity | None:
-    """How far arms differ, where they do; ``gain``: of the variances, by noise that neighbours share."""
+def _filtered(windows: list[Window], systems: list[Equations], through: Filter) -> list[Equations]:
+    return [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
+
+
+def _odd(systems: list[Equations], at: State) -> Regularity | None:
+    """How far arms differ, where they do."""
     if at.regularity is None:
         return None
     ways, variances = zip(*(e.free_ways(at.regularity.common) for e in systems), strict=True)
-    return told_by(list(ways), [gain * v for v in variances], at.regularity)
+    return told_by(list(ways), list(variances), at.regularity)
 
 
 def _far_apart(at: State, before: State) -> bool:
@@ -267,10 +279,10 @@ def _far_apart(at: State, before: State) -> bool:
     return bool(blurrier.max() > _MUCH[BLUR] or tapers.max() > _MUCH[TAPER])
 
 
-def _blurs(systems: list[Equations], gain: float) -> tuple[list[list[NeedleFit]], Differing] | None:
-    """Needles with blurs of their own, and how far these differ, where they do; ``gain``: of the variances, by noise of neighbours."""
+def _blurs(systems: list[Equations]) -> tuple[list[list[NeedleFit]], Differing] | None:
+    """Needles with blurs of their own, and how far these differ, where they do."""
     blurs, variances = zip(*(e.free_blurs() for e in systems), strict=True)
-    told = differing(list(blurs), [gain * v for v in variances], MOST_BLURRIER)
+    told = differing(list(blurs), list(variances), MOST_BLURRIER)
     if told is None:
         return None
     sets = [
@@ -280,10 +292,10 @@ def _blurs(systems: list[Equations], gain: float) -> tuple[list[list[NeedleFit]]
     return sets, told
 
 
-def _tapers(systems: list[Equations], at: State, gain: float) -> tuple[list[list[NeedleFit]], Differing] | None:
-    """Pins with tapers of their own, and how far these differ, where they do; ``gain``: of the variances, by noise of neighbours."""
+def _tapers(systems: list[Equations], at: State) -> tuple[list[list[NeedleFit]], Differing] | None:
+    """Pins with tapers of their own, and how far these differ, where they do."""
     tapers, variances = zip(*(e.free_tapers() for e in systems), strict=True)
-    told = differing(list(tapers), [gain * v for v in variances], MOST_TAPER)
+    told = differing(list(tapers), list(variances), MOST_TAPER)
     if told is None:
         return None
     sets = [

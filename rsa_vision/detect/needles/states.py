@@ -133,14 +133,12 @@ class State:
         return State(sets, self.moved + step.change, taper, sizes, self.blurs, self.tapers, known)
 
 
-def sizes_of(systems: list[Equations], sets: list[list[NeedleFit]]) -> Sizes:
+def sizes_of(systems: list[Equations]) -> Sizes:
     """What fits with sizes of their own tell of the sizes: pins of one cage are alike, but for how the rays meet them."""
-    size = np.array([[f.shape.half_width_px, f.shape.length_px] for members in sets for f in members])
-    variance = np.concatenate([e.variance_of_sizes for e in systems]) / size**2
-    values = np.log(size)
+    values, variance = (np.concatenate(of) for of in zip(*(e.free_sizes() for e in systems), strict=True))
     told = [true_spread(values[:, k], variance[:, k]) for k in range(2)]
     spread = np.stack([np.where(belongs, sd, np.inf) for _, sd, belongs in told], axis=1)
-    return Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(m) for m in sets])[:-1]))
+    return Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(e.members) for e in systems])[:-1]))
 
 
 def of_several_lengths(sizes: Sizes) -> bool:
