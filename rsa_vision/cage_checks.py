@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Issue = tuple[str, str]
 """(path in the file, message)"""
 
-EXPANSION_PER_C: Final[Mapping[str, float]] = {"plexiglas": 75e-6, "mirror glass": 8e-6, "quartz glass": 3.2e-6}  # selvik.md 3
+EXPANSION_PER_C: Final[Mapping[str, float]] = {"plexiglas": 75e-6, "mirror glass": 8e-6, "quartz glass": 3.2e-6}  # Selvik 1989, ch. 3
 PLANE_TOLERANCE_MM: Final = 0.01  # seen at 45 deg, a mark this far off its plane is displaced by as much: the size of one image error
 CONTROL_HEIGHT_MM: Final = 1.0  # a lower control point says nothing about the focus
 COINCIDENT_MM: Final = 0.1  # two marks this near are one mark entered twice

@@ -1,6 +1,6 @@
 """Cages: the content of cage files, and the built-in ones.
 
-A cage file is TOML as in ``interfaces.md``; lengths are mm in the laboratory frame of ``selvik.md`` 1. The built-in cages are
+A cage file is TOML as in docs/cages.md; lengths are mm in the laboratory frame of docs/conventions.md. The built-in cages are
 such files too.
 """
 
@@ -109,7 +109,7 @@ class Cage(Frozen):
         return tuple(sorted((m for m in self.mark if m.role == role and focus in m.foci), key=lambda m: m.number))
 
     def at_temperature(self, temperature_c: float | None) -> Cage:
-        """Return the cage with the coordinates it has at a temperature (``selvik.md`` 3).
+        """Return the cage with the coordinates it has at a temperature (Selvik 1989, ch. 3).
 
         Parameters
         ----------

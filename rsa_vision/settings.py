@@ -29,14 +29,14 @@ class Frozen(BaseModel):
 class Limits(Frozen):
     """Limits of verdicts and gross-error rules, with the defaults of the guideline and of Selvik."""
 
-    fiducial_um: Annotated[float, Field(gt=0)] = 250.0  # selvik.md 2, step 1
-    line_mm: Annotated[float, Field(gt=0)] = 2.0  # selvik.md 2, step 2 (8 x 250 um)
+    fiducial_um: Annotated[float, Field(gt=0)] = 250.0  # Selvik 1989, ch. 2, step 1
+    line_mm: Annotated[float, Field(gt=0)] = 2.0  # Selvik 1989, ch. 2, step 2 (8 x 250 um)
     focus_mm: Annotated[float, Field(gt=0)] = 150.0  # how far a focus may be from nominal
     crossing_sigma: Annotated[float, Field(gt=0)] = 5.0  # crossing line error in units of its own sigma
     calibration_px: Annotated[float, Field(ge=0)] = (
         0.5  # pairing tolerates this error of calibrated cameras; published ones reach 0.2 to 0.3
     )
-    parallax_um: Annotated[float, Field(gt=0)] = 100.0  # mean y-parallax that shows film bending (selvik.md 2, table 5)
+    parallax_um: Annotated[float, Field(gt=0)] = 100.0  # mean y-parallax that shows film bending (Selvik 1989, table 5)
     posterior: Annotated[float, Field(gt=0.5, lt=1)] = 0.999  # an identity below it is ambiguous
     e_rb_mm: Annotated[float, Field(gt=0)] = 0.35  # ISO 16087
     condition_number: Annotated[float, Field(gt=0)] = 120.0  # guideline
@@ -79,7 +79,7 @@ class Motion(Frozen):
 
 
 class Study(Frozen):
-    """The content of ``study.toml`` (interfaces.md)."""
+    """The content of ``study.toml`` (docs/quickstart.md)."""
 
     cage: str | None = None
     film: FilmMode | None = None
@@ -130,7 +130,7 @@ def load_study(path: Path) -> Study:
     Parameters
     ----------
     path : Path
-        A TOML file as in ``interfaces.md``; paths in it are taken relative to it. ``calibration`` may stand below ``[foci]``, where TOML
+        A TOML file as in docs/quickstart.md; paths in it are taken relative to it. ``calibration`` may stand below ``[foci]``, where TOML
         makes it a part of that table.
 
     Returns

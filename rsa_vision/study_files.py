@@ -1,4 +1,4 @@
-"""Which films belong together: a folder of files -> examinations (``interfaces.md``, "Which films belong together")."""
+"""Which films belong together: a folder of files -> examinations (docs/quickstart.md, "Measure your own films")."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def group_films(
     shared_possible : bool
         Whether one film can carry all foci (they have one fiducial plane).
     file_pattern : str or None
-        As in :func:`compile_pattern`; the rule of ``interfaces.md`` where None.
+        As in :func:`compile_pattern`; names like ``SUBJECT_EXAM[_fK][_cage].EXT`` where None.
     read_tags : callable or None
         Returns the DICOM tags of a file, or None if it is no DICOM file; for names that follow no rule and files without extension.
 

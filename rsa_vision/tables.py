@@ -1,4 +1,4 @@
-"""The tables in OUT: their columns (``interfaces.md``, "Files in OUT") and the rows of one examination."""
+"""The tables in OUT: their columns (docs/files.md) and the rows of one examination."""
 
 from __future__ import annotations
 

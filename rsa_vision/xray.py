@@ -1,4 +1,4 @@
-"""X-RAY: named image points of one examination -> 3-D markers with their covariances (Selvik 1989, ch. 2 and 4; selvik.md 2)."""
+"""X-RAY: named image points of one examination -> 3-D markers with their covariances (Selvik 1989, ch. 2 and 4)."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def calibration_error(markers_at: Callable[[float], Markers]) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControlCheck:
-    """Control points that more than one focus sees, re-computed as object points (selvik.md 2, step 2).
+    """Control points that more than one focus sees, re-computed as object points (Selvik 1989, ch. 2, step 2).
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The truth of an examination in the columns of ``images.csv``, ``foci.csv`` and ``markers.csv`` (interfaces.md)."""
+"""The truth of an examination in the columns of ``images.csv``, ``foci.csv`` and ``markers.csv`` (docs/files.md)."""
 
 from __future__ import annotations
 

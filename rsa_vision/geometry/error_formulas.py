@@ -1,4 +1,4 @@
-"""Selvik's error formulas for two foci at the same height over the fiducial plane (Selvik 1989, ch. 5; selvik.md 4).
+"""Selvik's error formulas for two foci at the same height over the fiducial plane (Selvik 1989, ch. 5).
 
 They hold for an object half-way between the foci and errors in one plane; the propagation in :mod:`rsa_vision.xray` holds everywhere.
 Errors keep the unit they are given in; all lengths of the set-up are mm.

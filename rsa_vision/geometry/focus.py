@@ -1,4 +1,4 @@
-"""Steps 1 and 2 of X-RAY for one focus, and its rays, both with their errors (selvik.md 2)."""
+"""Steps 1 and 2 of X-RAY for one focus, and its rays, both with their errors (Selvik 1989, ch. 2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Selvik's rule for gross errors (selvik.md 2): leave each mark out in turn, drop the one whose omission fits best."""
+"""Selvik's rule for gross errors (Selvik 1989, ch. 2): leave each mark out in turn, drop the one whose omission fits best."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def homography_jacobians(plane_from_film: Float, film_px: Float) -> tuple[Float,
 
 
 def fit_homography(film_px: Float, plane_mm: Float) -> Float:
-    """Fit the projective transformation with the least sum of squared distances in the plane (selvik.md 2, step 1).
+    """Fit the projective transformation with the least sum of squared distances in the plane (Selvik 1989, ch. 2, step 1).
 
     The given plane coordinates count as exact and all marks weigh the same, as in X-RAY; the start is the normalised direct linear
     transformation, the minimum is found by Levenberg's and Marquardt's method. An affine deformation of the film, its mirror image

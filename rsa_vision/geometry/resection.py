@@ -1,4 +1,4 @@
-"""Position of a focus from the lines through control points and their transformed images (selvik.md 2, step 2)."""
+"""Position of a focus from the lines through control points and their transformed images (Selvik 1989, ch. 2, step 2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The built-in cages are those of the printed table (``selvik.md`` 6)."""
+"""The built-in cages are those of the printed table (docs/cages.md)."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from rsa_vision.geometry.resection import locate_focus
 
 PRINTED = 0.55  # tables without decimals: half a unit, and a little for his rounding of the input
 TENTH = 0.06  # tables with one decimal
-TABLE_7_Z = 35.3  # printed 35.2; selvik.md 4
+TABLE_7_Z = 35.3  # printed 35.2; the formula gives 35.3
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from rsa_vision.errors import UsageError
 from rsa_vision.store import fingerprint, is_finished, read_tables, record_path, write_atomic, write_tables
 from rsa_vision.tables import SCHEMAS, failed_rows
 
-# interfaces.md, "Files in OUT"
+# what is published of the columns: docs/files.md
 PUBLISHED = {
     "exams": "subject, exam, status, reasons, files, method, n_markers, mean_parallax_um, seconds",
     "images": "subject, exam, focus, role, number, shape, col_px, row_px, sd_col_px, sd_row_px, cov_col_row_px2, x_mm, y_mm, z_mm, "
