@@ -168,9 +168,7 @@ def draw(seed: int, name: str) -> Examination:
 def measure(exam: Examination) -> ExaminationResult:
     """Name and reconstruct an examination as the program does."""
     films = [
-        FilmReading(
-            Path(f"{exam.name}_{exam.seed}_f{focus or ''}"), focus, film.shape, 12, (PITCH_MM, PITCH_MM), "told", "auto", film.images
-        )
+        FilmReading(Path(f"{exam.name}_{exam.seed}_f{focus or ''}"), focus, film.shape, (PITCH_MM, PITCH_MM), "auto", film.images)
         for focus, film in exam.films
     ]
     return name_and_reconstruct(films, exam.study, exam.cage)

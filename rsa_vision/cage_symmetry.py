@@ -39,8 +39,6 @@ class Symmetry:
         The focus that takes the place of each; on a shared film they may change places.
     number_to : mapping
         ``{(focus, number): number}``: the mark that takes the place of each, of focus ``focus_to[focus]``.
-    focus_shift_mm : float
-        Largest distance between a nominal focus, moved, and the nominal one it is taken for.
     """
 
     foci: tuple[int, ...]
@@ -49,7 +47,6 @@ class Symmetry:
     matrix: Float
     focus_to: Mapping[int, int]
     number_to: Mapping[tuple[int, int], int]
-    focus_shift_mm: float
 
     def __str__(self) -> str:
         films = "the film" if len(self.foci) > 1 else f"the film of focus {self.foci[0]}"
@@ -125,7 +122,7 @@ def _of_plane(cage: Cage, plane: Plane) -> list[Symmetry]:
                     kind: Literal["rotation", "mirror"] = "rotation" if np.linalg.det(linear) > 0 else "mirror"
                     angle = float(np.rad2deg(np.arctan2(linear[1, 0], linear[0, 0])))
                     angle = angle % 360 if kind == "rotation" else (angle / 2) % 180
-                    found.append(Symmetry(foci, kind, angle, motion[:2, [0, 1, 3]], focus_to, numbers, shift))
+                    found.append(Symmetry(foci, kind, angle, motion[:2, [0, 1, 3]], focus_to, numbers))
     return found
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from time import perf_counter
 from typing import Final, TypedDict
 
 import numpy as np
@@ -63,8 +62,6 @@ class ExaminationResult:
         None where it failed. Its points are `points`, flags extended.
     verdict : Verdict
     method : str
-    seconds : mapping
-        Time by stage.
     sightlines : Sightlines
         What the films leave open.
     """
@@ -75,7 +72,6 @@ class ExaminationResult:
     reconstruction: Reconstruction | None
     verdict: Verdict
     method: str = "selvik"
-    seconds: Mapping[str, float] = field(default_factory=dict)
     sightlines: Sightlines = field(default_factory=Sightlines.none)
 
 
@@ -105,19 +101,13 @@ def measure_examination(
         Expected failures (no pitch, cage not found, too few marks) are verdicts, not exceptions.
     """
     table = Readings.of(())
-    seconds: dict[str, float] = {}
-    started = perf_counter()
     try:
         every = [*cage_films, *films]
         pitches = [require_pitch(film, study.pixel_pitch_mm) if isinstance(geometry, Cage) else None for film, _ in every]
         table = Readings.of([_read(*exposed, pitch, study) for exposed, pitch in zip(every, pitches, strict=True)])
     except RsaError as error:
-        return _failed(table, [(error.code, str(error))], seconds)
-    seconds["detect"] = perf_counter() - started
-    started = perf_counter()
-    result = name_and_reconstruct(table.films, study, geometry, n_cage_films=len(cage_films))
-    seconds["name and reconstruct"] = perf_counter() - started
-    return replace(result, seconds=seconds)
+        return _failed(table, [(error.code, str(error))])
+    return name_and_reconstruct(table.films, study, geometry, n_cage_films=len(cage_films))
 
 
 @in_one_thread
@@ -266,7 +256,7 @@ def _read(film: Film, focus: int | None, pitch_mm: tuple[float, float] | None, s
     rows, cols = film.values.shape
     limit = study.limits.false_detections_per_film
     found = detect_markers(film.values, bits=film.bits, response=study.response, false_detections=limit).images
-    return FilmReading(film.path, focus, (rows, cols), film.bits, pitch_mm, film.pitch_source, study.response, found)
+    return FilmReading(film.path, focus, (rows, cols), pitch_mm, study.response, found)
 
 
 def _unlike_cage_films(cage_films: Sequence[FilmReading], films: Sequence[FilmReading]) -> list[Finding]:
@@ -329,8 +319,8 @@ def _stretch(film: FilmReading, found: CageIdentification) -> list[Finding]:
     return findings
 
 
-def _failed(readings: Readings, findings: Sequence[Finding], seconds: Mapping[str, float] | None = None) -> ExaminationResult:
-    return ExaminationResult(readings.films, readings.points, readings.source, None, conclude(findings), seconds=seconds or {})
+def _failed(readings: Readings, findings: Sequence[Finding]) -> ExaminationResult:
+    return ExaminationResult(readings.films, readings.points, readings.source, None, conclude(findings))
 
 
 def _judged(readings: Readings, reconstruction: Reconstruction, findings: Sequence[Finding]) -> ExaminationResult:

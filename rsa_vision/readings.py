@@ -36,10 +36,8 @@ class FilmReading:
         None: it carries all foci.
     shape : tuple of two ints
         (rows, cols).
-    bits : int
     pitch_mm : tuple of two floats, or None
         (row, column) pitch as used; None with calibrated cameras, which need none.
-    pitch_source : str
     response : str
         As set: `auto` leaves it to the film.
     images : MarkerImages
@@ -48,9 +46,7 @@ class FilmReading:
     path: Path
     focus: int | None
     shape: tuple[int, int]
-    bits: int
     pitch_mm: tuple[float, float] | None
-    pitch_source: str
     response: str
     images: MarkerImages
 

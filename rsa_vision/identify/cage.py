@@ -60,8 +60,6 @@ class CageIdentification:
         ``{focus: ndarray of shape (3, 3)}``: (col, row, 1) to plane coordinates (u, v, 1).
     dropped : tuple of (int, str, int, int)
         Focus, role, number and image of marks that were named at first and left out: gross errors, or another image suits as well.
-    residual_mm : mapping
-        ``{focus: {(role, number): distance on the film between image and model}}``.
     log_evidence : float
         Of the hypothesis against clutter.
     """
@@ -75,7 +73,6 @@ class CageIdentification:
     focus_mm: Mapping[int, Float]
     plane_from_film: Mapping[int, Float]
     dropped: tuple[tuple[int, str, int, int], ...]
-    residual_mm: Mapping[int, Mapping[tuple[str, int], float]]
     log_evidence: float
 
     def __bool__(self) -> bool:
@@ -307,7 +304,7 @@ class _Answer:
 
     def failed(self, why: str) -> CageIdentification:
         nothing = np.zeros(len(self.images), bool)
-        return CageIdentification({}, nothing, nothing.copy(), 0.0, ("cage-not-found",), why, {}, {}, (), {}, -np.inf)
+        return CageIdentification({}, nothing, nothing.copy(), 0.0, ("cage-not-found",), why, {}, {}, (), -np.inf)
 
     def found(
         self,
@@ -321,15 +318,13 @@ class _Answer:
     ) -> CageIdentification:
         scene = self.scene
         assignments: dict[int, dict[tuple[str, int], int]] = {focus: {} for focus in scene.foci}
-        residuals: dict[int, dict[tuple[str, int], float]] = {focus: {} for focus in scene.foci}
         foreign, explained = np.zeros(len(self.images), bool), np.zeros(len(self.images), bool)
-        for row, residual in zip(naming.rows, naming.fit.residual_mm, strict=True):
+        for row in naming.rows:
             image = int(self.usable[naming.image[row]])
             explained[image] = True
             if scene.own[row]:
                 focus, key = self._key(int(row))
                 assignments[focus][key] = image
-                residuals[focus][key] = float(np.hypot(*residual))
             else:
                 foreign[image] = True
         for focus in scene.foci:
@@ -360,7 +355,6 @@ class _Answer:
             {focus: scene.lab_mm(places[k]) for k, focus in enumerate(scene.foci)},
             {f: H / H[2, 2] for f, H in planes.items()},
             dropped,
-            residuals,
             score,
         )
 

@@ -44,8 +44,6 @@ class Pairing:
         Posterior below the limit.
     crossing_sigma : ndarray of shape (g,)
         Largest crossing distance within the group in units of its sigma.
-    rivals : tuple of tuple of int
-        For each group the likeliest different one that claims an image of it; empty if none.
     unmatched : ndarray of int
         Images that are in no group, rising.
     slack_mm : float
@@ -63,7 +61,6 @@ class Pairing:
     posterior: Float
     ambiguous: Bool
     crossing_sigma: Float
-    rivals: tuple[tuple[int, ...], ...]
     unmatched: Int
     slack_mm: float
     reasons: tuple[str, ...]
@@ -110,7 +107,7 @@ def pair_rays(
     images = np.unique(bundle.image)
     crossings, neighbours = find_crossings(bundle, region)
     if not len(crossings):
-        return Pairing((), np.zeros(0), np.zeros(0, bool), np.zeros(0), (), images, 0.0, ())
+        return Pairing((), np.zeros(0), np.zeros(0, bool), np.zeros(0), images, 0.0, ())
     slack = common_error(crossings) if slack_mm is None else slack_mm
     crossings = crossings.with_slack(slack)
     crossings = crossings.rows(crossings.distance_mm < limits.crossing_sigma * crossings.sigma_mm)
@@ -127,7 +124,7 @@ def pair_rays(
         gain = share @ crossings.log_ratio(usual_mm, scale, freedom) + membership @ (look + place)
         gain += np.array([of_quality[list(g)].sum() + (np.log(prior / (1 - prior)) - unsaid) * (len(g) - 1) for g in groups])
         packing = pack(claims, gain)
-        prior = _fraction(groups, packing, len(images), foci)
+        prior = _fraction(groups, packing, len(images))
         posterior = np.nan_to_num(packing.posterior)
         paired = np.zeros(int(images.max()) + 1)
         for claim, probability in zip(claims, posterior, strict=True):
@@ -194,7 +191,7 @@ def _groups(bundle: RayBundle, crossings: Crossings, foci: int) -> tuple[list[tu
     return groups, share, membership
 
 
-def _fraction(groups: list[tuple[int, ...]], packing: Packing, images: int, foci: int) -> float:
+def _fraction(groups: list[tuple[int, ...]], packing: Packing, images: int) -> float:
     """Return the fraction of images that have a partner."""
     sizes = np.array([len(g) for g in groups])
     paired = float((np.nan_to_num(packing.posterior) * sizes).sum())
@@ -214,11 +211,6 @@ def _pairing(
     chosen = np.flatnonzero(packing.chosen & ~(packing.posterior < 0.5))
     sigmas = crossings.distance_mm / crossings.sigma_mm
     claimed = [set(bundle.image[list(g)].tolist()) for g in groups]
-    rivals = []
-    for g in chosen:
-        others = [h for h in range(len(groups)) if h != g and claimed[h] & claimed[g] and not set(groups[h]) < set(groups[g])]
-        best = max(others, key=lambda h: float(np.nan_to_num(packing.posterior[h], nan=1.0)), default=-1)
-        rivals.append(groups[best] if best >= 0 else ())
     posterior = packing.posterior[chosen]
     ambiguous = ~(posterior >= limits.posterior)
     taken = np.unique([i for g in chosen for i in claimed[g]]).astype(int)
@@ -227,7 +219,6 @@ def _pairing(
         posterior,
         ambiguous,
         np.array([sigmas[membership[g] > 0].max() for g in chosen]),
-        tuple(rivals),
         np.setdiff1d(images, taken),
         slack,
         ("pair-ambiguous",) if ambiguous.any() else (),

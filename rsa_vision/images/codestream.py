@@ -23,7 +23,6 @@ class Stream(NamedTuple):
     kind: int
     scan: int
     density: tuple[int, int, int] | None
-    signed: bool = False
 
 
 def jpeg_stream(data: bytes) -> Stream:
@@ -67,7 +66,7 @@ def jpeg2000_stream(data: bytes) -> Stream:
     if len(set(parts)) > 1 or parts[0][1:] != (1, 1):
         raise ValueError("JPEG 2000 components of unequal size")
     depth = parts[0][0]
-    return Stream(rows - top, cols - left, (depth & 0x7F) + 1, samples, 0, 42 + 3 * samples, None, bool(depth & 0x80))
+    return Stream(rows - top, cols - left, (depth & 0x7F) + 1, samples, 0, 42 + 3 * samples, None)
 
 
 def ends(data: bytes, scan: int, padding: int | None = None) -> bool:

@@ -41,7 +41,7 @@ def examine(rng: np.random.Generator, foci: int, places: Float, hidden: set[tupl
         px, n = seen(places[rows], TURNS_DEG[focus]) + rng.normal(0, SD_PX, (len(rows), 2)), len(rows)
         covariance = np.tile(np.eye(2) * SD_PX**2, (n, 1, 1))
         look = (np.full(n, "ball"), np.full(n, 2.5), np.full(n, np.nan), *np.full((2, n), 0.5), np.full(n, 40.0), np.zeros(n, np.int64))
-        films.append(FilmReading(Path(f"f{focus}"), focus, (SIZE, SIZE), 12, None, "", "auto", MarkerImages(px, covariance, *look)))
+        films.append(FilmReading(Path(f"f{focus}"), focus, (SIZE, SIZE), None, "auto", MarkerImages(px, covariance, *look)))
         turn = Rotation.from_euler("y", TURNS_DEG[focus], degrees=True).as_matrix()
         cameras[focus] = Camera((SIZE, SIZE), MATRIX, turn, np.array([0, 0, DISTANCE_MM]))
     result = name_and_reconstruct(films, Study(), cameras)

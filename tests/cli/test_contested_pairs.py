@@ -48,7 +48,7 @@ def examination(seed: int) -> tuple[Any, list[Segment], dict[str, Float]]:
     objects = Objects(places, np.full(n, 0.4), np.full(n, 0.3), np.zeros(n))
     exposure = random_exposure(rng, cage, pitch_mm=0.1, false_images=0, missing=0, slack_mm=0.0, mirrored=False)
     film = expose(cage, (1, 2), exposure, rng, objects)
-    reading = FilmReading(Path("S_1.tif"), None, film.shape, 12, (0.1, 0.1), "told", "auto", film.images)
+    reading = FilmReading(Path("S_1.tif"), None, film.shape, (0.1, 0.1), "auto", film.images)
     return examination_rows("S", "1", [], name_and_reconstruct([reading], Study(), cage), 0.0), segments, true
 
 

@@ -215,9 +215,7 @@ def test_so_is_one_that_was_cut(rows: int) -> None:
     one = replace(
         images, **{f.name: np.zeros((1, *getattr(images, f.name).shape[1:]), getattr(images, f.name).dtype) for f in fields(images)}
     )
-    films = [
-        FilmReading(Path(name), 1, (n, 900), 16, (0.1, 0.1), "file", "auto", one) for name, n in (("a_cage.tif", rows), ("a.tif", 1000))
-    ]
+    films = [FilmReading(Path(name), 1, (n, 900), (0.1, 0.1), "auto", one) for name, n in (("a_cage.tif", rows), ("a.tif", 1000))]
     verdict = name_and_reconstruct(films, Study(cage="2"), load_cage("2"), n_cage_films=1).verdict
     assert (verdict.reasons == ("cage-film-differs",)) == (rows != 1000)
     assert verdict.status == "failed"  # one mark is no cage

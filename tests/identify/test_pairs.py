@@ -178,7 +178,6 @@ def test_twins_in_one_epipolar_plane_are_told_by_size_or_doubted() -> None:
         twins = [g for g, group in enumerate(blind.groups) if {rays.marker[rays.bundle.image[row]][1] for row in group} & {0, 1}]
         assert all(blind.ambiguous[g] or rays.right(blind.groups[g]) for g in twins)
         assert blind.reasons == ("pair-ambiguous",)
-        assert all(blind.rivals[g] for g in twins)
     assert decided > 0
 
 
