@@ -61,7 +61,6 @@ class ExaminationResult:
     reconstruction : Reconstruction or None
         None where it failed. Its points are `points`, flags extended.
     verdict : Verdict
-    method : str
     sightlines : Sightlines
         What the films leave open.
     """
@@ -71,7 +70,6 @@ class ExaminationResult:
     source: Int | None
     reconstruction: Reconstruction | None
     verdict: Verdict
-    method: str = "selvik"
     sightlines: Sightlines = field(default_factory=Sightlines.none)
 
 

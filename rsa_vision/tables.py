@@ -92,7 +92,7 @@ def examination_rows(subject: str, exam: str, files: Iterable[str], result: Exam
         "status": result.verdict.status,
         "reasons": ";".join(result.verdict.reasons),
         "files": ";".join(files),
-        "method": result.method,
+        "method": METHOD,
         "n_markers": determined,
         "mean_parallax_um": float(parallax.mean()) if parallax.size else None,
         "seconds": round(seconds, 3),
@@ -106,9 +106,7 @@ def examination_rows(subject: str, exam: str, files: Iterable[str], result: Exam
     return finite | result.sightlines.rows()
 
 
-def failed_rows(
-    subject: str, exam: str, files: Iterable[str], code: str, message: str, seconds: float = 0.0, method: str = "selvik"
-) -> Rows:
+def failed_rows(subject: str, exam: str, files: Iterable[str], code: str, message: str, seconds: float = 0.0) -> Rows:
     """Return the rows of an examination of which nothing is known but why it failed."""
     row: Row = {"subject": subject, "exam": exam, "status": "failed", "reasons": code, "files": ";".join(files), "method": METHOD}
     row |= {"n_markers": 0, "mean_parallax_um": None, "seconds": round(seconds, 3), "message": message}

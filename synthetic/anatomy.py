@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from rsa_vision.types import Float
 from synthetic.film import FilmPlane
 from synthetic.render import Image
-from synthetic.scene import LEAD_PER_MM, STEEL_PER_MM, TITANIUM_PER_MM, Ellipsoid, Pin, Scene, Solid
+from synthetic.scene import LEAD_PER_MM, STEEL_PER_MM, TITANIUM_PER_MM, Ellipsoid, Pin, Solid
 
 Distractor = Literal["screw", "wire", "staple", "letter", "dust", "scratch"]
 DISTRACTORS: Final[tuple[Distractor, ...]] = ("screw", "wire", "staple", "letter", "dust", "scratch")
@@ -55,9 +55,7 @@ def _ellipsoid(
     return Ellipsoid(np.asarray(centre), np.diag(1 / np.array(semi_axes)) @ rotation, attenuation, softness)
 
 
-def distractor_solids(
-    kinds: Collection[str], scene: Scene, films: Mapping[str, FilmPlane], box_mm: Float, rng: np.random.Generator
-) -> tuple[Solid, ...]:
+def distractor_solids(kinds: Collection[str], films: Mapping[str, FilmPlane], box_mm: Float, rng: np.random.Generator) -> tuple[Solid, ...]:
     """Return one or a few solids of each kind: in the box (2, 3), letters on the films.
 
     Raises

@@ -144,10 +144,10 @@ def shape_solids(
     return [Pin(position_mm, axis, length_mm, diameter_mm / 2, taper_mm, attenuation) for axis in axes]
 
 
-def shift_foci(cage: Cage, shift_mm: float, rng: np.random.Generator, nominal: Mapping[int, Float] | None = None) -> dict[int, Float]:
+def shift_foci(cage: Cage, shift_mm: float, rng: np.random.Generator) -> dict[int, Float]:
     """Return the foci moved from nominal by ``shift_mm``, each in a random direction."""
     moved = {}
-    for focus, nominal_mm in sorted((nominal or cage.foci).items()):
+    for focus, nominal_mm in sorted(cage.foci.items()):
         direction = rng.standard_normal(3)
         moved[focus] = np.array(nominal_mm, float) + shift_mm * direction / np.linalg.norm(direction)
     return moved

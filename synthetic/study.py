@@ -55,12 +55,12 @@ class RenderedExamination:
     foci: pl.DataFrame
     markers: pl.DataFrame
 
-    def write(self, folder: Path, *, with_pitch: bool = True, white_is_zero: bool = False) -> list[Path]:
+    def write(self, folder: Path, *, with_pitch: bool = True) -> list[Path]:
         """Write the films (not the truth) into a folder and return their paths."""
         folder.mkdir(parents=True, exist_ok=True)
         pitch = self.pitch_mm if with_pitch else None
         for name, values in self.films.items():
-            write_film(folder / name, values, bits=self.bits, pitch_mm=pitch, white_is_zero=white_is_zero)
+            write_film(folder / name, values, bits=self.bits, pitch_mm=pitch)
         return [folder / name for name in self.films]
 
 
@@ -185,7 +185,7 @@ def render_examination(
         gaps: dict[str, Any] = {"gap_diameters": gap_diameters, "clear_of_marks": clear_of_marks, "box_mm": box}
         markers = place_objects(scene, film_of, count, rng=rng, diameter_mm=object_diameter_mm, **gaps)
         markers = share_out(markers, segments) if segments else markers
-    solids = distractor_solids(kinds, scene, planes, box, rng)
+    solids = distractor_solids(kinds, planes, box, rng)
     tissue = tissue_with_bones(box, rng) if bone else ()
     scene = Scene(cage, sources, tuple(markers), solids, tissue, **bare)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.find import STRENGTH, significance_limit
+from rsa_vision.detect.balls.find import significance_limit
 from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.film.wavelets import height_of_waves
 from rsa_vision.detect.marks.found import marks_of
@@ -21,7 +21,7 @@ from rsa_vision.detect.marks.response import BITS, high_balls, in_film_values, i
 from rsa_vision.detect.marks.waves import like_waves
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.first_pins import MOST_STROKES, look_for_pins
-from rsa_vision.detect.search.candidates import find_candidates
+from rsa_vision.detect.search.candidates import STRENGTH, find_candidates
 from rsa_vision.detect.search.strokes import at_junctions
 from rsa_vision.threads import in_one_thread
 from rsa_vision.types import MarkerImages
@@ -72,7 +72,7 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     -------
     Detection
     """
-    limit = significance_limit(values.size, 2.5, false_detections)
+    limit = significance_limit(values.size, false_detections)
     noise = estimate_noise(values, bits)
     found = _detect(values, bits, noise, limit)
     if not found:
@@ -87,7 +87,7 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
 
 def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, only: int | None = None) -> list[tuple[float, Detection]]:
     """Return what is found of either polarity worth a look, with its evidence; ``only``: of that, in no other scale of the values."""
-    faint = find_candidates(values, STRENGTH, noise)
+    faint = find_candidates(values, noise)
     candidates = faint.rows(np.abs(faint.strength) > STRENGTH)
     # strokes at junctions are arms of tees, most likely: they are looked at once it is known that there are none
     strokes = candidates.strokes[:MOST_STROKES]

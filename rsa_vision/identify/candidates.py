@@ -32,6 +32,8 @@ THIN_MM: Final = 1.0  # height of a triangle that determines no pose
 ALIKE: Final = 4.0  # variances of predicted places are alike up to this ratio
 CHUNK: Final = 1000  # poses that are fitted at once
 MOST_CLIMBED: Final = 40  # assignments from which better ones are sought
+LOOSE: Final = 0.02  # probability that a marker found has moved in its bone
+LOOSE_MM: Final = 3.0  # how far a marker may have moved in its bone and still be known by its place
 
 
 def candidate_poses(body: Cloud, points: Cloud, log_worth: float) -> list[tuple[Pairs, Placement]]:
@@ -78,7 +80,7 @@ def candidate_poses(body: Cloud, points: Cloud, log_worth: float) -> list[tuple[
     return list(found.items())
 
 
-def loose_triples(body: Cloud, points: Cloud, triples: Iterable[Pairs], chance: float, reach_mm: float) -> list[tuple[Pairs, Placement]]:
+def loose_triples(body: Cloud, points: Cloud, triples: Iterable[Pairs]) -> list[tuple[Pairs, Placement]]:
     """List all ways to name the points of triples by their markers if two keep their distance, and the third has moved in its bone.
 
     Parameters
@@ -86,10 +88,6 @@ def loose_triples(body: Cloud, points: Cloud, triples: Iterable[Pairs], chance: 
     body, points : Cloud
     triples : iterable of tuple of (marker, point)
         Three pairs each.
-    chance : float
-        Probability that a marker has moved.
-    reach_mm : float
-        How far it may be from its place.
 
     Returns
     -------
@@ -110,15 +108,15 @@ def loose_triples(body: Cloud, points: Cloud, triples: Iterable[Pairs], chance: 
     side = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     nearest = there[:, :2].mean(axis=1) + foot * axis + np.linalg.norm(height, axis=1, keepdims=True) * side
     thin = np.minimum(np.linalg.norm(height, axis=1), np.linalg.norm(away, axis=1)) < THIN_MM
-    near = np.flatnonzero(~thin & (np.linalg.norm(there[:, 2] - nearest, axis=1) < reach_mm))
+    near = np.flatnonzero(~thin & (np.linalg.norm(there[:, 2] - nearest, axis=1) < LOOSE_MM))
     if not len(near):
         return []
-    ball = points.covariance_mm2[hits[near, 2]] + reach_mm**2 / 5 * np.eye(3)  # a ball has this covariance
+    ball = points.covariance_mm2[hits[near, 2]] + LOOSE_MM**2 / 5 * np.eye(3)  # a ball has this covariance
     turned = Cloud(np.concatenate([points.position_mm, nearest[near]]), np.concatenate([points.covariance_mm2, ball]))
     at = np.column_stack([hits[near, :2], len(points) + np.arange(len(near))])
     named = [tuple(zip(mine, theirs, strict=True)) for mine, theirs in zip(marks[near].tolist(), hits[near].tolist(), strict=True)]
     return [
-        (pairs, replace(placement, log_likelihood=placement.log_likelihood + float(np.log(chance))))
+        (pairs, replace(placement, log_likelihood=placement.log_likelihood + float(np.log(LOOSE))))
         for pairs, placement in zip(named, place_many(body, turned, marks[near], at), strict=True)
         if placement
     ]

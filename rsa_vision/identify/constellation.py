@@ -14,15 +14,13 @@ import numpy as np
 from scipy.special import expit, gammaln
 
 from rsa_vision.geometry.rigid import LEAST_POINTS
-from rsa_vision.identify.candidates import candidate_poses, disjoint, loose_triples
+from rsa_vision.identify.candidates import LOOSE, LOOSE_MM, candidate_poses, disjoint, loose_triples
 from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import GATE, Cloud, Pairs, Placement, nearness, place, volume_mm3
 from rsa_vision.types import Bool, Float, Int
 
 FOUND: Final = 0.9  # probability that a marker of a known segment is among the points
 STRAY: Final = 3.0  # expected points that belong to nothing known, at least
-LOOSE: Final = 0.02  # probability that a marker found has moved in its bone
-LOOSE_MM: Final = 3.0  # how far a marker may have moved in its bone and still be known by its place
 LOOSE_SIGMA: Final = 4.0  # residual of a marker that has moved
 TURN_RAD: Final = 0.5  # sd of the rotation of a body about each axis since it was seen before,
 TURNED: Final = 1e-3  # but for so many that are turned anyhow
@@ -141,7 +139,7 @@ def _rivals(segment: Cloud, points: Cloud, volume: float, stray: float) -> list[
         near = [((int(lost[i]), int(free[a])),) for i, a in np.argwhere(away < LOOSE_MM).tolist()]
         rivals += [(odds, pairs, (), placement.rotation), *((odds + float(gain), pairs, one, placement.rotation) for one in near)]
     triples = [pairs for _, pairs, _ in groups if len(pairs) == LEAST_POINTS]
-    for pairs, placement in loose_triples(segment, points, triples, LOOSE, LOOSE_MM):
+    for pairs, placement in loose_triples(segment, points, triples):
         rivals.append((log_odds(len(segment), placement, pairs, volume, stray), pairs[:2], pairs[2:], placement.rotation))
     rivals = [rival for rival in rivals if rival[0] > NEGLIGIBLE]
     return sorted(rivals, key=lambda rival: (-rival[0], rival[1:3]))[:MOST_RIVALS]
@@ -188,7 +186,7 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
         rivals = _additions(before, points, rigid, named, volume)
         few, uncounted = _counted(rivals, len(points))
         triples = [pairs for _, pairs, _ in few if pairs in rigid and len(pairs) == LEAST_POINTS]
-        turned = dict(loose_triples(before, points, triples, LOOSE, LOOSE_MM))
+        turned = dict(loose_triples(before, points, triples))
         competing = [*few, *_additions(before, points, turned, named, volume)]
         chances, best = _summed(competing, len(points))
         chosen = [competing[g][1] for g in best]

@@ -26,11 +26,12 @@ TURNS: Final = 3  # of scale and trust, which depend on each other
 WORSE: Final = 0.03  # part of the pairs whose error is WORSE_SIGMA times what is stated: a neighbour or an edge beside an image
 WORSE_SIGMA: Final = 3.0
 BOUND: Final = 3.0  # times what is usual: from there on an error is no more than a bound
+HIGHEST: Final = 0.8  # of a focus above its plane, to which an object may reach
 
 Region = Callable[[Float], Bool]
 
 
-def cage_region(cage: Cage, foci_mm: Mapping[int, Float], *, highest: float = 0.8) -> Region:
+def cage_region(cage: Cage, foci_mm: Mapping[int, Float]) -> Region:
     """Return where an object may be: before every fiducial plane of the foci, and not too near to a focus.
 
     Parameters
@@ -38,8 +39,6 @@ def cage_region(cage: Cage, foci_mm: Mapping[int, Float], *, highest: float = 0.
     cage : Cage
     foci_mm : mapping
         Foci in the laboratory frame.
-    highest : float
-        As a fraction of the focus's height above its plane.
 
     Returns
     -------
@@ -50,7 +49,7 @@ def cage_region(cage: Cage, foci_mm: Mapping[int, Float], *, highest: float = 0.
     for focus, place in foci_mm.items():
         origin, basis = cage.plane_of(focus).lab_from_plane()
         normal = np.cross(basis[0], basis[1])
-        planes.append((origin, normal, highest * float((np.asarray(place) - origin) @ normal)))
+        planes.append((origin, normal, HIGHEST * float((np.asarray(place) - origin) @ normal)))
 
     def inside(points: Float) -> Bool:
         heights = [((points - origin) @ normal, top) for origin, normal, top in planes]

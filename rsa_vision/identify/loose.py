@@ -13,7 +13,8 @@ import numpy as np
 from scipy.special import gammaln
 
 from rsa_vision.geometry.rigid import LEAST_POINTS
-from rsa_vision.identify.constellation import LOOSE, LOOSE_MM, LOOSE_SIGMA, log_usual
+from rsa_vision.identify.candidates import LOOSE, LOOSE_MM
+from rsa_vision.identify.constellation import LOOSE_SIGMA, log_usual
 from rsa_vision.identify.groups import rigid_groups
 from rsa_vision.identify.poses import Cloud, Pairs, place
 

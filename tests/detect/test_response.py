@@ -50,7 +50,7 @@ def test_balls_on_films_of_light_are_where_they_are_said_to_be(speed: float, bit
         film = stored((2**bits - 1) * light, bits)
         error, its_ratio = errors(detect_markers(film, bits=bits).images, truth)
         away, ratio = [*away, *error], [*ratio, *its_ratio]
-        [(_, bright)] = _detect(film, bits, estimate_noise(film, bits), significance_limit(film.size, 2.5, 0.1), only=1)
+        [(_, bright)] = _detect(film, bits, estimate_noise(film, bits), significance_limit(film.size, 0.1), only=1)
         away_in_light += errors(bright.images, truth)[0].tolist()
     assert np.sqrt(np.mean(np.square(away_in_light)) / np.mean(np.square(away))) > BETTER[speed]
     assert np.sqrt(np.mean(np.square(away))) < LARGEST_PX
@@ -90,6 +90,6 @@ def test_films_of_other_scales_stay_as_they_are() -> None:
     film = stored(60000 * (1 - exposure) + 400 * rng.standard_normal(exposure.shape))
     images = detect_markers(film, bits=16).images
     # sums in several threads differ in their last digits, and fits go on with these
-    [(_, bright)] = in_one_thread(_detect)(film, 16, estimate_noise(film, 16), significance_limit(film.size, 2.5, 0.1), only=1)
+    [(_, bright)] = in_one_thread(_detect)(film, 16, estimate_noise(film, 16), significance_limit(film.size, 0.1), only=1)
     assert len(images) == len(truth)
     np.testing.assert_array_equal(images.position_px, bright.images.position_px)

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.balls.decide import faint_beside
-from rsa_vision.detect.balls.find import STRENGTH, fit_at
+from rsa_vision.detect.balls.find import fit_at
 from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
@@ -95,7 +95,7 @@ def test_blur_comes_from_clean_tees_where_crossing_arms_look_stronger(seed: int)
     tips = np.concatenate([clean, crossed, beside])
     film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
     noise = estimate_noise(film, 16)
-    junctions = find_candidates(film, STRENGTH, noise).junctions
+    junctions = find_candidates(film, noise).junctions
     gap = np.hypot(*(junctions[:, None, :2] - tips).transpose(2, 0, 1)).min(axis=1)
     junctions[gap > 6.0, 4] *= 100.0
     assert np.count_nonzero(gap > 6.0) > 6
@@ -121,7 +121,7 @@ def test_noise_under_tees_that_no_tile_of_the_film_tells(seed: int) -> None:
     counts = rng.poisson(seen * 120.0) / 120.0
     film = np.clip(np.rint(10000 / counts), 0, 65535).astype(np.uint16)
     noise = estimate_noise(film, 16)
-    junctions = find_candidates(film, STRENGTH, noise).junctions
+    junctions = find_candidates(film, noise).junctions
     told = noise_under_needles(film, first_tees(film, junctions[junctions[:, 4] < 0], noise), GUESS, noise)
     top = told.level[-1]
     expected = (noise.variance_at(noise.level[-1:]) * (top / noise.level[-1]) ** 3)[0]
@@ -227,7 +227,7 @@ def test_what_is_blotted_out_beside_tees_does_not_tell_what_bone_does_to_them() 
     tips = tips_of(rng)
     film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
     noise, optics = estimate_noise(film, 16), Optics(SIGMA_PX, 0.8)
-    candidates = find_candidates(film, STRENGTH, noise)
+    candidates = find_candidates(film, noise)
     found, _, optics = find_tees(film, candidates.junctions, candidates.strokes, optics, noise)
     bare = film.astype(np.float64)
     for col, row in np.rint(tips[::3] + np.array([SIDE / (2 * CELLS), 0])).astype(int):
@@ -295,7 +295,7 @@ def test_tees_over_bones_are_no_pins(deep: float, thick: float, edge_px: float, 
 def test_what_lies_between_bright_arms_is_no_dark_tee() -> None:
     film, _ = film_with_shafts(np.random.default_rng(0), 0.5, 1.0, 6.0)
     noise = estimate_noise(film, 16)
-    found = find_candidates(film, STRENGTH, noise).junctions
+    found = find_candidates(film, noise).junctions
     bright = found[found[:, 4] < 0]
     assert first_tees(film, bright, noise)
     turned = bright * [1, 1, 1, 1, -1]  # as if the search had answered to something dark there

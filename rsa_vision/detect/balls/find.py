@@ -20,7 +20,6 @@ from rsa_vision.types import Bool, Float
 BATCH = 96  # windows that stay in the cache
 _LIKE = 1.25  # ratio of their sizes
 _PADDED = 10_000  # pixels by which smaller ones may be too large besides: another batch costs as much
-STRENGTH = 4.5  # candidates answer the filter by this many local spreads; real beads on bone start at about 5
 ROUNDNESS = 0.2  # less round extrema are ridges
 COARSE_SIGMA_PX, COARSE_MU_PX = 1.1, 0.5  # for the first look only
 _COARSE_BLUR = 0.25  # of the radius that answers, where that is more: between the sharpest and the softest images there are
@@ -32,6 +31,7 @@ EXPLAINED = 0.9
 PROMISING = 0.85  # of the significance a mark must have: better fits are 3 % more significant mostly, 10 % at the most
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 _CAP, _CAP_MISFIT, _CAP_SURE = 0.4, 0.03, 20.0  # of a ball seen, that is enough if it leaves so little and stands out so far
+_SMALLEST_PX = 2.5  # radius of the smallest marks looked for: so many independent places has a film
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
 
@@ -213,15 +213,13 @@ def refine(grid: tuple[float, ...], costs: list[float]) -> float:
     return float(np.exp(np.clip(-b / (2 * a), x[0], x[2]))) if a > 0 else float(grid[k])
 
 
-def significance_limit(film_size: int, radius_px: float, false_detections: float) -> float:
+def significance_limit(film_size: int, false_detections: float) -> float:
     """Return the depth, in standard deviations, that noise alone exceeds ``false_detections`` times on a film.
 
     Parameters
     ----------
     film_size : int
         Pixels.
-    radius_px : float
-        Smallest radius looked for; it sets the number of independent places.
     false_detections : float
         Expected number for the whole film.
 
@@ -229,7 +227,7 @@ def significance_limit(film_size: int, radius_px: float, false_detections: float
     -------
     float
     """
-    places = film_size / (np.pi * radius_px**2) * 4  # four filters
+    places = film_size / (np.pi * _SMALLEST_PX**2) * 4  # four filters
     limit = 3.0
     for _ in range(20):  # a fit goes to the highest point around: maxima of a random field are 0.44 u^2 as many as the tail alone has it
         limit = float(-ndtri(min(0.5, false_detections / (places * max(1.0, 0.44 * limit**2)))))

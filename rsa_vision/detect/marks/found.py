@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.crowd import lost_in_a_crowd, out_of_a_crowd
 from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, are_balls, faint_beside, look_clear, show_what_marks_are_like
-from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, STRENGTH, fit_at, misfit, plausible
+from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, fit_at, misfit, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
@@ -40,7 +40,7 @@ from rsa_vision.detect.neighbours.laid_on import fit_over, look_on_arms, over_ar
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.neighbours.rims import goes_on
 from rsa_vision.detect.neighbours.under_curve import under_curve
-from rsa_vision.detect.search.candidates import Candidates
+from rsa_vision.detect.search.candidates import STRENGTH, Candidates
 from rsa_vision.types import Bool, Float, Int, MarkerImages
 
 _PULL = 0.1  # of the radius of a ball, by which a needle over it moves its centre

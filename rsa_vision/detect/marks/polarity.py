@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, faint_beside, height_of
-from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, ROUNDNESS, STRENGTH, distinct, first_look
+from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, ROUNDNESS, distinct, first_look
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import BESIDE_NEEDLES, noise_at_marks
 from rsa_vision.detect.balls.optics import CAP, ball_evidence, estimate_optics
@@ -24,7 +24,7 @@ from rsa_vision.detect.needles.pins import on_pins, optics_of_pins
 from rsa_vision.detect.needles.pointed import is_slim
 from rsa_vision.detect.needles.tees import GUESS, first_tees, optics_of_tees
 from rsa_vision.detect.neighbours.holes import are_holes
-from rsa_vision.detect.search.candidates import Candidates
+from rsa_vision.detect.search.candidates import STRENGTH, Candidates
 from rsa_vision.detect.search.junctions import ALONE
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.decide import LEAST_KNOWN, like_clear, look_clear, over_clutter
 from rsa_vision.detect.balls.find import (
-    STRENGTH,
     SURE,
     distinct,
     fit_at,
@@ -33,7 +32,7 @@ from rsa_vision.detect.neighbours.beside import Background, all_but, images_besi
 from rsa_vision.detect.neighbours.crossed import without_scratches
 from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.neighbours.lines import balls_on_lines, on_lines
-from rsa_vision.detect.search.candidates import SCALES, Candidates
+from rsa_vision.detect.search.candidates import SCALES, STRENGTH, Candidates
 from rsa_vision.types import Bool, Float
 
 _CLEAR = 0.9  # of the limit, over clutter

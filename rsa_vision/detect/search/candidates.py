@@ -28,6 +28,7 @@ SCALES = ((1, 0.85, 1.4, 2.6), (1, 1.4, 2.2, 4.4), (2, 1.2, 1.9, 7.5), (3, 1.0, 
 REACH = 3.0  # blur widths to which kernels go
 LARGEST = 25  # pixels at half resolution: wider areas at an end of the range are none of a mark
 SMOOTH, FROM_FILM = 5, 4.0  # of such pixels: over which a film is averaged before it is carried on into them; where centres may be
+STRENGTH = 4.5  # local spreads by which candidates answer the filter; real beads on bone start at about 5
 FAINT = 0.86  # of what counts as significant: extrema of so much are listed too, for looks that know what they look for
 ROUNDING = 0.5  # variance, in stored values, that rounding counts for: neighbours round the same way, so it does not average out
 JUNCTION_SCALE = (1, 4.4)  # the filter on whose answer the arms of tees are looked for
@@ -67,21 +68,19 @@ class Candidates:
         return Candidates(*chosen, self.junctions, self.strokes)
 
 
-def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> Candidates:
+def find_candidates(film: NDArray[Any], noise: NoiseModel) -> Candidates:
     """Find local extrema of the multi-scale filter.
 
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
-    threshold : float
-        Strength that counts, in units of the local spread; extrema down to ``FAINT`` of it are listed.
     noise : NoiseModel
         Its smallest variance is what the spread is at least taken for: saturated and blank areas have none of their own.
 
     Returns
     -------
     Candidates
-        Strongest of neighbouring extrema first; both polarities.
+        Those down to ``FAINT`` of the strength that counts, strongest of neighbouring ones first; both polarities.
     """
     found: list[Float] = []
     junctions: list[Float] = []
@@ -94,7 +93,7 @@ def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> 
         top -= top % 8
         band = film[top:bottom]
         stop = start + BAND if start + BAND < rows else rows + BAND
-        for into, table in zip((found, junctions, strokes), _band_extrema(band, threshold, noise, work), strict=True):
+        for into, table in zip((found, junctions, strokes), _band_extrema(band, noise, work), strict=True):
             table[:, 1] += top
             into.append(table[(table[:, 1] >= start) & (table[:, 1] < stop)])
     table = np.concatenate(found)
@@ -106,7 +105,7 @@ def find_candidates(film: NDArray[Any], threshold: float, noise: NoiseModel) -> 
     return Candidates(table[:, :2], table[:, 2], table[:, 3], table[:, 4], joined, strokes_found)
 
 
-def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work: NDArray[np.float32]) -> tuple[Float, Float, Float]:
+def _band_extrema(band: NDArray[Any], noise: NoiseModel, work: NDArray[np.float32]) -> tuple[Float, Float, Float]:
     """``work``: rows with room for the band at half resolution."""
     pad = (-band.shape[0] % 8, -band.shape[1] % 8)
     if any(pad):
@@ -130,11 +129,11 @@ def _band_extrema(band: NDArray[Any], threshold: float, noise: NoiseModel, work:
         at = (level, outer)
         answer = cv2.subtract(blurred, begun, dst=begun)
         spread = _local_spread(answer, _white_spread(noise, level, inner, outer))
-        limit = cv2.resize(threshold * spread, (answer.shape[1], answer.shape[0]), dst=limit, interpolation=cv2.INTER_LINEAR)
+        limit = cv2.resize(STRENGTH * spread, (answer.shape[1], answer.shape[0]), dst=limit, interpolation=cv2.INTER_LINEAR)
         significance = cv2.divide(answer, limit, dst=limit)
         place = np.flatnonzero((significance > FAINT) | (significance < -FAINT))
         strength = np.asarray(significance.ravel()[place], np.float64)
-        out.append(_extrema(answer, place, threshold * strength, level, radius))
+        out.append(_extrema(answer, place, STRENGTH * strength, level, radius))
         clear = np.abs(strength) > 1
         if (level, radius) == JUNCTION_SCALE:
             junctions = find_junctions(significance, place[clear], strength[clear], level)
