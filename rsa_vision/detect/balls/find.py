@@ -14,6 +14,7 @@ from rsa_vision.detect.balls.fits import BallFits, fit_balls, half_size, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Beside
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
 
@@ -41,7 +42,7 @@ def fit_at(
     radius_px: Float,
     optics: Optics,
     noise: NoiseModel,
-    others: Any = None,
+    others: Beside | None = None,
     *,
     quick: bool = False,
     sparse: bool = False,

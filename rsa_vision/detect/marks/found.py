@@ -28,13 +28,14 @@ from rsa_vision.detect.marks.unsteady import Marks, by_lines, unsteady_lines
 from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.balls_beside import lapped
 from rsa_vision.detect.needles.first_pins import look_for_pins
 from rsa_vision.detect.needles.fits import significant_misfit
 from rsa_vision.detect.needles.pins import find_pins
 from rsa_vision.detect.needles.sets import as_usual, is_located, on_arms
 from rsa_vision.detect.needles.tees import find_tees, is_tee
-from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, groups_of, images_beside, lapping_balls
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, groups_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.neighbours.laid_on import fit_over, look_on_arms, over_arms
 from rsa_vision.detect.neighbours.oblong import are_oblong
@@ -228,7 +229,7 @@ def _taken_apart(film: NDArray[Any], found: Balls, needles: _Needles, optics: Op
     poor |= np.array([significant_misfit(tee, noise) > DOUBTFUL * MISFIT for tee in needles.tees], bool)
     clean = [tee for tee, odd in zip(needles.tees, poor, strict=True) if not odd]
 
-    def without(tee: NeedleFit) -> Background:
+    def without(tee: NeedleFit) -> Images:
         return lambda cols, rows: painted(cols, rows) - needle_image(cols - tee.position_px[0], rows - tee.position_px[1], tee, tee_optics)
 
     tried = [(tee, without(tee)) if odd else (tee, None) for tee, odd in zip(needles.tees, poor, strict=True)]

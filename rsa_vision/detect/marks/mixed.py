@@ -18,8 +18,8 @@ from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.needles import NeedleFit, arm_images
 from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import fit_crossing
-from rsa_vision.detect.neighbours.beside import Background
 from rsa_vision.detect.neighbours.laid_on import fit_one_over
 from rsa_vision.types import Float
 
@@ -36,7 +36,7 @@ def part(
     optics: Optics,
     needle_optics: Optics,
     noise: NoiseModel,
-    beside: Background,
+    beside: Images,
     is_one: Callable[[NeedleFit], bool],
     start_px: Float | None = None,
 ) -> tuple[NeedleFit, BallFits] | None:
@@ -75,10 +75,10 @@ def part(
         total: Float = beside(cols, rows) + shown(cols, rows)
         return total
 
-    def fitted(at_px: Float, size: float) -> tuple[BallFits, Float, Background]:
+    def fitted(at_px: Float, size: float) -> tuple[BallFits, Float, Images]:
         return fit_one_over(film, at_px, size, without_needle, optics, noise, arms)
 
-    def sought() -> tuple[BallFits, Float, Background]:
+    def sought() -> tuple[BallFits, Float, Images]:
         return fitted(_brightest_rest(film, needle, np.sign(depth), without_needle) if start_px is None else start_px, radius)
 
     arms = paint([(needle, needle_optics)])

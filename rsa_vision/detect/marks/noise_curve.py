@@ -14,7 +14,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.whitening import variance_left, whiten_rows
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import Beside
+from rsa_vision.detect.models.shown import Beside
 from rsa_vision.types import Float
 
 _LEAST = 8  # balls that tell something

@@ -18,7 +18,8 @@ from rsa_vision.detect.balls.usual import over_kinds
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, Background, all_but, deep_at, groups_of, images_beside, lapping_balls
+from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, all_but, deep_at, groups_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.blobs import split_blobs
 from rsa_vision.detect.neighbours.crowds import resolve_crowds
 from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
@@ -115,7 +116,7 @@ def resolve_balls(
     if len(seeds.depth) == 0:
         none = np.zeros(0, bool)
         return Balls(seeds, none, none, none, none, np.zeros((0, 2, 2)), None)
-    tees: Background | None = needles
+    tees: Images | None = needles
     others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
@@ -324,7 +325,7 @@ def inside(fits: BallFits, film: NDArray[Any]) -> Bool:
 
 
 def _unexplained_pairs(
-    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, sized: bool, optics: Optics, tees: Background | None
+    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, sized: bool, optics: Optics, tees: Images | None
 ) -> list[Float]:
     """Starts of groups, rows of (col, row, radius), at peaks off all known balls.
 
@@ -396,7 +397,7 @@ def _is_bar(fits: BallFits, like: BallFits, touch_px: float, noise: NoiseModel) 
     return bool(unlike.any() or (apart.min(axis=1) < _NECKS * fits.radius_px).any())
 
 
-def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
+def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Images | None) -> BallFits:
     """Fit a large crowd one by one, each with the images of all others subtracted, until they settle."""
     for _ in range(4):
         last = fits

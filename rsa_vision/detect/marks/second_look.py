@@ -28,7 +28,8 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.resolve import inside
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import Background, all_but, images_beside
+from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.neighbours.beside import all_but, images_beside
 from rsa_vision.detect.neighbours.crossed import without_scratches
 from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.neighbours.lines import balls_on_lines, on_lines
@@ -104,7 +105,7 @@ class _Look:
     noise: NoiseModel
     needles: Painted | None
 
-    def beside(self, known: BallFits) -> Background:
+    def beside(self, known: BallFits) -> Images:
         """Images of needles and of all these balls."""
         return all_but(known, np.arange(0), self.optics, self.needles)
 

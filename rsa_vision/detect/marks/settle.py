@@ -32,7 +32,7 @@ from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.shoulder import Curve, curve_of, shown, unseen_slope
 from rsa_vision.detect.marks.resolve import Balls
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import Beside
+from rsa_vision.detect.models.shown import Beside
 from rsa_vision.detect.neighbours.edges import OF_SHIFT
 from rsa_vision.detect.neighbours.foreign import foreign, in_line, robust_residual
 from rsa_vision.detect.neighbours.specks import Specks, find_specks, how_rough

@@ -22,7 +22,8 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import Background, images_beside
+from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.neighbours.beside import images_beside
 from rsa_vision.types import Bool, Float, Int
 
 _ASKED, _LEAST, _PLACES = 36, 6, 100  # balls that tell; free places of one size
@@ -100,7 +101,7 @@ class Marks:
     film: NDArray[Any]
     balls: BallFits
     needles: list[NeedleFit]
-    painted: Background | None
+    painted: Images | None
     optics: Optics
     noise: NoiseModel
 

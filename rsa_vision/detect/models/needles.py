@@ -7,7 +7,7 @@ Here the tip is a parameter of the image.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,8 +17,6 @@ from rsa_vision.detect.models.needle_tables import FINE_Q, LOG_GRID, Key, cell_o
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
 
-Images = Callable[[Float, Float], Float]
-"""Images of some marks at pixels (cols, rows), in film values over the background."""
 _BLUR_GRID = 0.002  # of the logarithm of a needle's own blur
 _UNEVEN_GRID = 0.02  # between what is uneven, of the blur of an arm, that has tables of its own
 

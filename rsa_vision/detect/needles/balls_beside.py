@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.fits import BallFits
-from rsa_vision.detect.models.needles import Images, NeedleFit
+from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.types import Bool, Float
 
 _FADED = 2.0  # blurs beyond the rim of a ball, to which it hides what is under it

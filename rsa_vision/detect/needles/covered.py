@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import EXPLAINED, MISFIT, SURE
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.needles import Images, NeedleFit, arm_images, needle_image
+from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image
 from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import Window, fit_crossing, window_of
 from rsa_vision.detect.needles.fits import PROMISING, explains
 from rsa_vision.detect.needles.sets import NEAREST_PX, on_arms, others_beside

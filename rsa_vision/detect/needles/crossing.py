@@ -14,8 +14,9 @@ from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.edge import edge_profile
-from rsa_vision.detect.models.needles import Images, NeedleFit, arm_images, needle_image, support
+from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, PROMISING, between, explains, scored, step_of
 from rsa_vision.types import Bool, Float, Int
 

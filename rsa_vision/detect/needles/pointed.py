@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import MISFIT
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.needles import Images, NeedleFit
+from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import Unseen, chi2_of, fit_crossing, window_of
 from rsa_vision.detect.needles.fits import STANDS_OUT, explains, fit_needles, significant_misfit
 from rsa_vision.types import Float

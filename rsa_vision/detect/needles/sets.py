@@ -11,8 +11,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.needles import Images, NeedleFit, needle_image
+from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import fit_crossing
 from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.types import Bool, Float

@@ -17,6 +17,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.covered import find_covered, uncovered
 from rsa_vision.detect.needles.crossing import chi2_of, fit_crossing, moved, window_of
 from rsa_vision.detect.needles.edges import beside_edges, proportion_of
@@ -115,7 +116,7 @@ def _found_from(
         tees = fit_all(film, tees, optics, noise)
     around = tees
 
-    def others_of(mine: list[NeedleFit]) -> Any:
+    def others_of(mine: list[NeedleFit]) -> Images | None:
         return others_beside(mine, [t for t in around if all(t is not m for m in mine)], optics)
 
     tees = split_twins(film, tees, optics, noise, is_tee, others_of)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import fit_crossing
 from rsa_vision.types import Float
 
@@ -32,7 +33,7 @@ def split_twins(
     optics: Optics,
     noise: NoiseModel,
     is_tee: Judge,
-    others: Callable[[list[NeedleFit]], Any],
+    others: Callable[[list[NeedleFit]], Images | None],
 ) -> list[NeedleFit]:
     """Replace every tee that is none by two, where two explain it.
 
@@ -80,7 +81,7 @@ def _left(fit: NeedleFit) -> float:
     return fit.misfit * abs(fit.depth)
 
 
-def _blurred(film: NDArray[Any], tee: NeedleFit, blurrier: float, optics: Optics, noise: NoiseModel, beside: Any) -> NeedleFit:
+def _blurred(film: NDArray[Any], tee: NeedleFit, blurrier: float, optics: Optics, noise: NoiseModel, beside: Images | None) -> NeedleFit:
     """Fit a tee with a blur of its own."""
     return fit_crossing(film, [replace(tee, blurrier=blurrier)], optics, noise, others=beside, steps=10)[0]
 
@@ -93,7 +94,7 @@ def _split(
     optics: Optics,
     noise: NoiseModel,
     is_tee: Judge,
-    others: Any,
+    others: Images | None,
 ) -> list[NeedleFit]:
     fresh = [d * np.array([np.cos(a), np.sin(a)]) for d in APART_PX for a in _EIGHTHS]
     best: tuple[float, list[NeedleFit]] = (np.inf, [])

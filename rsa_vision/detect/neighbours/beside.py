@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,8 @@ from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls.fits import BallFits, ball_image
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.types import Bool, Float, Int
-
-Background = Callable[[Float, Float], Float]
-"""Images at pixels (cols, rows), in film values."""
-
-Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
-"""Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
 
 TOUCH = 3.0  # blur widths between two rims within which one ball disturbs the fit of the other
 MOST_IN_GROUP = 5
@@ -41,12 +35,12 @@ def lapping_balls(fits: BallFits) -> Bool:
     return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
 
 
-def all_but(known: BallFits, members: Int, optics: Optics, tees: Background | None) -> Background:
+def all_but(known: BallFits, members: Int, optics: Optics, tees: Images | None) -> Images:
     """Return the images of the tees and of all balls but ``members``, as a function of pixels (cols, rows)."""
     return lambda cols, rows: images_beside(known, members, optics, tees, cols, rows)[0]
 
 
-def images_beside(known: BallFits, members: Int, optics: Optics, tees: Background | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
+def images_beside(known: BallFits, members: Int, optics: Optics, tees: Images | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
     """Return the images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
     total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
     doubtful: Bool = np.zeros(cols.shape, np.bool_)
@@ -73,7 +67,7 @@ def without_balls(film: NDArray[Any], balls: BallFits, optics: Optics) -> NDArra
     return out
 
 
-def deep_at(film: NDArray[Any], peaks: Float, radius: float, tees: Background | None) -> Float:
+def deep_at(film: NDArray[Any], peaks: Float, radius: float, tees: Images | None) -> Float:
     """How far the film less its tees differs at these places from the median of a ring well outside a ball there."""
     angle = 2 * np.pi * np.arange(16) / 16
     reach = 2 * radius + 3

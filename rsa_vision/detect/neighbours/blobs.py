@@ -15,6 +15,7 @@ from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.balls.usual import kinds_by_size
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.types import Float
 
@@ -35,7 +36,7 @@ def split_blobs(
     balls: BallFits,
     optics: Optics,
     noise: NoiseModel,
-    beside: Callable[[], Any],
+    beside: Callable[[], Images],
 ) -> list[BallFits]:
     """Explain blobs that are no single balls by two.
 

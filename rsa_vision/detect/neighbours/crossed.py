@@ -12,7 +12,7 @@ from rsa_vision.detect.balls.find import fit_at, no_fits
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import Background
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.foreign import beyond_noise, robust_residual
 from rsa_vision.detect.neighbours.group_images import images_in, window_around
 from rsa_vision.types import Bool, Float
@@ -21,7 +21,7 @@ _LEAST_SEEN: Final = 0.4  # part of the pixels under a ball
 _ROUNDS: Final = 2  # the first mask is that of a fit which the scratch has pulled
 
 
-def without_scratches(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, others: Background) -> BallFits:
+def without_scratches(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, others: Images) -> BallFits:
     """Fit balls again without the pixels that a robust fit leaves over.
 
     Parameters
@@ -50,7 +50,7 @@ def without_scratches(film: NDArray[Any], fits: BallFits, optics: Optics, noise:
     return out.rows(out.valid_fraction > _LEAST_SEEN)
 
 
-def _masked(film: NDArray[Any], ball: BallFits, optics: Optics, noise: NoiseModel, others: Background) -> BallFits | None:
+def _masked(film: NDArray[Any], ball: BallFits, optics: Optics, noise: NoiseModel, others: Images) -> BallFits | None:
     """Fit a ball once without what is foreign; none where that is as broad as the ball: bars and letters leave such rests."""
     window = window_around(film, ball.position_px, ball.radius_px, optics.sigma_px, noise, others)
     local = ball.position_px - window.corner_px

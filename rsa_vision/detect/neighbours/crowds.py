@@ -13,7 +13,8 @@ from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, MISFIT, fit_at, misfi
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import Background, all_but, deep_at
+from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.neighbours.beside import all_but, deep_at
 from rsa_vision.detect.neighbours.blobs import LEAST_APART, STRETCH, long_axis
 from rsa_vision.detect.neighbours.group_images import images_in, window_around
 from rsa_vision.detect.neighbours.groups import fit_group
@@ -41,7 +42,7 @@ def resolve_crowds(
     found: BallFits,
     optics: Optics,
     noise: NoiseModel,
-    tees: Background | None,
+    tees: Images | None,
 ) -> BallFits:
     """Explain what was left over by a few of the film's own balls.
 
@@ -99,7 +100,7 @@ def resolve_crowds(
     return found
 
 
-def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
+def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, tees: Images | None) -> BallFits:
     """Put a crowd to the balls found, fitted again together with those that it laps over."""
     gap = np.hypot(*(found.position_px[:, None] - crowd.position_px[None]).transpose(2, 0, 1))
     near = (gap < found.radius_px[:, None] + crowd.radius_px).any(axis=1)
@@ -112,7 +113,7 @@ def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics
     return join([found.rows(~near), crowd])
 
 
-def _crowd(film: NDArray[Any], blob: BallFits, known: BallFits, optics: Optics, noise: NoiseModel, others: Any) -> BallFits | None:
+def _crowd(film: NDArray[Any], blob: BallFits, known: BallFits, optics: Optics, noise: NoiseModel, others: Images) -> BallFits | None:
     """Return the fewest balls that explain a blob."""
     radius, sign = float(np.median(known.radius_px)), float(np.sign(blob.depth[0]))
 
@@ -134,7 +135,7 @@ def _crowd(film: NDArray[Any], blob: BallFits, known: BallFits, optics: Optics, 
     return None
 
 
-def _most_left(film: NDArray[Any], fits: BallFits, radius: float, optics: Optics, noise: NoiseModel, others: Any) -> Float:
+def _most_left(film: NDArray[Any], fits: BallFits, radius: float, optics: Optics, noise: NoiseModel, others: Images) -> Float:
     """Place, shape (1, 2), where one more ball would explain most of what these leave."""
     window = window_around(film, fits.position_px, fits.radius_px, optics.sigma_px, noise, others)
     local = fits.position_px - window.corner_px

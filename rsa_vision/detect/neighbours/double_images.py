@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import columns
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Beside
 from rsa_vision.detect.neighbours.blobs import STRETCH, long_axis
 from rsa_vision.detect.neighbours.group_images import GroupWindow, images_in, window_around
 from rsa_vision.detect.neighbours.groups import fit_group
@@ -21,7 +23,14 @@ _LEAST_SPREAD, _MOST_SPREAD = 0.2, 0.35  # of the logarithms of what balls of on
 
 
 def gain_over_two(
-    film: NDArray[Any], drawn: BallFits, images: Any, single: BallFits, known: BallFits, optics: Optics, noise: NoiseModel, others: Any
+    film: NDArray[Any],
+    drawn: BallFits,
+    images: Callable[[int, Float, Float], Float],
+    single: BallFits,
+    known: BallFits,
+    optics: Optics,
+    noise: NoiseModel,
+    others: Beside | None,
 ) -> tuple[Float, Float]:
     """Compare each ball drawn by a spot with two balls like those of the film, fitted freely.
 

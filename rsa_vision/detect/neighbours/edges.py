@@ -16,7 +16,8 @@ from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits, join
 from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, all_but, groups_of
+from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, all_but, groups_of
 from rsa_vision.detect.neighbours.groups import edge_gain, fit_group
 from rsa_vision.types import Bool
 
@@ -35,7 +36,7 @@ def beside_edges(
     fits: BallFits,
     optics: Optics,
     noise: NoiseModel,
-    tees: Background | None,
+    tees: Images | None,
     spot: Spot | None = None,
     *,
     wanted: Callable[[BallFits], Bool] | None = None,

@@ -19,6 +19,7 @@ from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.film_curve import film_curve, slope_of_film_curve
 from rsa_vision.detect.models.lapping import LEAST, lapping, product_image, product_with
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.types import Float
 
 _BESIDE = 2.0  # blur widths between two rims, within which their images lie over each other
@@ -48,7 +49,9 @@ class GroupWindow:
         return data - basis @ weighted_least_squares(basis, weight, data), weight
 
 
-def window_around(film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: float, noise: NoiseModel, others: Any) -> GroupWindow:
+def window_around(
+    film: NDArray[Any], at_px: Float, radius_px: Float, sigma_px: float, noise: NoiseModel, others: Images | None
+) -> GroupWindow:
     """Cut the window that balls at these places need, with the images of neighbours as of :func:`fit_group`."""
     middle = at_px.mean(0)
     half = half_size(float(radius_px.max()), sigma_px) + int(np.ceil(float(np.abs(at_px - middle).max())))

@@ -14,6 +14,7 @@ from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import columns, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.whitening import whiten_rows
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.group_images import GroupImages, GroupWindow, images_in, window_around
 from rsa_vision.types import Float
 
@@ -32,7 +33,7 @@ def fit_group(
     sigma_px: float,
     mu_px: float,
     noise: NoiseModel,
-    others: Any = None,
+    others: Images | None = None,
     *,
     edge: bool = False,
     taken: bool = False,
@@ -167,7 +168,13 @@ def _estimator(weighted: Float, size: int, noise: NoiseModel) -> Float:
 
 
 def edge_gain(
-    film: NDArray[Any], fits: BallFits, sigma_px: float, mu_px: float, noise: NoiseModel, others: Any = None, spot: Spot | None = None
+    film: NDArray[Any],
+    fits: BallFits,
+    sigma_px: float,
+    mu_px: float,
+    noise: NoiseModel,
+    others: Images | None,
+    spot: Spot | None,
 ) -> float:
     """Return twice the log-likelihood that an edge in the background would gain, to first order (the score test of Rao, 1948).
 

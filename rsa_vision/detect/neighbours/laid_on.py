@@ -17,7 +17,8 @@ from rsa_vision.detect.film.patches import weighted_least_squares
 from rsa_vision.detect.models.lapping import fine_places
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import Background, all_but
+from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.neighbours.beside import all_but
 from rsa_vision.detect.neighbours.edges import OF_SHIFT
 from rsa_vision.detect.neighbours.group_images import GroupImages, GroupWindow, images_in, images_over, window_around
 from rsa_vision.detect.neighbours.groups import fit_group
@@ -73,8 +74,8 @@ def fit_over(
 
 
 def fit_one_over(
-    film: NDArray[Any], at_px: Float, radius_px: float, others: Background, optics: Optics, noise: NoiseModel, painted: Painted
-) -> tuple[BallFits, Float, Background]:
+    film: NDArray[Any], at_px: Float, radius_px: float, others: Images, optics: Optics, noise: NoiseModel, painted: Painted
+) -> tuple[BallFits, Float, Images]:
     """Fit one ball on needles.
 
     Parameters

@@ -19,7 +19,8 @@ from rsa_vision.detect.film.patches import cut, damped_solution
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, Background, all_but, groups_of, images_beside
+from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, all_but, groups_of, images_beside
 from rsa_vision.detect.neighbours.group_images import square
 from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.detect.neighbours.rims import goes_on
@@ -30,7 +31,7 @@ _FAR = 1.5  # times the significance that a mark must have, for one that lies on
 _OF_ENDS = 3.0  # the same, that the end of a line may keep
 
 
-def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, tees: Background | None) -> BallFits:
+def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, tees: Images | None) -> BallFits:
     """Drop the parts of lines, and fit again what was fitted together with them.
 
     Parameters
@@ -65,7 +66,7 @@ def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Opti
     return join(parts)
 
 
-def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, tees: Background | None) -> Bool:
+def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, tees: Images | None) -> Bool:
     """Say which faint balls a line explains better, and add little to it.
 
     Both are judged by likelihood, in noise made white. A ball on a wire is more than that: it keeps its significance beside any profile.
@@ -104,7 +105,7 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
 
 
 def balls_on_lines(
-    film: NDArray[Any], place_px: Float, radius_px: float, limit: float, optics: Optics, noise: NoiseModel, others: Background
+    film: NDArray[Any], place_px: Float, radius_px: float, limit: float, optics: Optics, noise: NoiseModel, others: Images
 ) -> BallFits:
     """Fit balls of this size at places that a line explains best, but not all of them.
 
@@ -131,7 +132,7 @@ def balls_on_lines(
     return join([no_fits(), *(fit_group(film, at[None], *how, edge=True) for at in worth)])
 
 
-def _gains(film: NDArray[Any], at_px: Float, radius_px: float, optics: Optics, noise: NoiseModel, others: Background) -> Float:
+def _gains(film: NDArray[Any], at_px: Float, radius_px: float, optics: Optics, noise: NoiseModel, others: Images) -> Float:
     """Return twice the log-likelihood that a ball, a line, and both gain over a background alone, to first order.
 
     For places (n, 2), shape (n, 3).

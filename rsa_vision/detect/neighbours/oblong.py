@@ -17,7 +17,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.profiles import Optics, ball_table
-from rsa_vision.detect.neighbours.beside import Beside
+from rsa_vision.detect.models.shown import Beside
 from rsa_vision.types import Bool, Float
 
 _LEAST = 0.08  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make twice that

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.fits import BallFits
-from rsa_vision.detect.neighbours.beside import Beside
+from rsa_vision.detect.models.shown import Beside
 from rsa_vision.types import Bool, Float, Int
 
 BEYOND: Final = 2.0  # blur widths outside the rim, where hardly anything of a ball is left

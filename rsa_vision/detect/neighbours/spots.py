@@ -22,6 +22,7 @@ from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.profiles import Optics, ball_table
+from rsa_vision.detect.models.shown import Beside, Images
 from rsa_vision.detect.neighbours.blobs import LEAST_GAIN
 from rsa_vision.detect.neighbours.double_images import gain_over_two
 from rsa_vision.types import Bool, Float
@@ -86,7 +87,7 @@ class _State:
     linear: Float  # (n, 7): depth and background
 
 
-def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics, noise: NoiseModel, others: Any) -> Drawn:
+def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics, noise: NoiseModel, others: Beside | None) -> Drawn:
     """Find the spot that explains odd images, and fit the balls that it explains.
 
     Parameters
@@ -168,7 +169,7 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
 
 
 def _drawn_as_well(
-    film: NDArray[Any], clean: BallFits, spot: _State, kept: Bool, half: int, optics: Optics, noise: NoiseModel, others: Any
+    film: NDArray[Any], clean: BallFits, spot: _State, kept: Bool, half: int, optics: Optics, noise: NoiseModel, others: Beside | None
 ) -> Bool:
     """Say which of these the spot explains better than a Gaussian does, as balls of the size of those that told it."""
     if len(clean.depth) == 0:
@@ -196,7 +197,7 @@ def _start(odd: BallFits, window: _Window, along: Float) -> _State:
     return _State(along, odd.position_px - window.corner, _SHRINK * odd.radius_px, np.zeros((len(odd.depth), 7)))
 
 
-def _window(film: NDArray[Any], balls: BallFits, half: int, others: Any, noise: NoiseModel) -> _Window:
+def _window(film: NDArray[Any], balls: BallFits, half: int, others: Beside | None, noise: NoiseModel) -> _Window:
     patches = cut(film, balls.position_px, half, noise)
     corner, n = patches.corner_px.astype(np.float64), len(balls.depth)
     rows, cols = np.mgrid[0 : patches.size, 0 : patches.size].astype(np.float64)
@@ -337,7 +338,7 @@ def _table(w: _Window, s: _State, odd: BallFits, optics: Optics, noise: NoiseMod
     return fits, by_spot[:, :2, :2]
 
 
-def with_spot(others: Any, balls: BallFits, spot: Spot | None, optics: Optics) -> Any:
+def with_spot(others: Images | None, balls: BallFits, spot: Spot | None, optics: Optics) -> Images | None:
     """Return what makes the images of these balls beside those of ``others``, at pixels (cols, rows)."""
     if spot is None:
         return others

@@ -21,7 +21,8 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import weighted_least_squares
 from rsa_vision.detect.models.film_curve import by_film_curve, film_curve
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.neighbours.beside import Background, all_but
+from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.neighbours.beside import all_but
 from rsa_vision.detect.neighbours.group_images import GroupWindow, ImagesUnderCurve, images_under_curve, opacities_in, window_around
 from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.types import Bool, Float, Int
@@ -102,7 +103,7 @@ def under_curve(
     groups: list[Int],
     optics: Optics,
     noise: NoiseModel,
-    tees: Background | None,
+    tees: Images | None,
 ) -> tuple[BallFits, Bool]:
     """Fit balls that lie over each other with the curve of the film, if it shows that it is bent.
 
@@ -154,7 +155,7 @@ def _as_good(found: BallFits, before: BallFits) -> bool:
 
 
 def _told_curve(
-    film: NDArray[Any], known: BallFits, singles: Int, groups: list[Int], optics: Optics, noise: NoiseModel, tees: Background | None
+    film: NDArray[Any], known: BallFits, singles: Int, groups: list[Int], optics: Optics, noise: NoiseModel, tees: Images | None
 ) -> _State | None:
     """Ask balls for the curve of their film; as for :func:`under_curve`; None where the film does not show that it is bent."""
     best = singles[np.argsort(-known.significance[singles])][:_MOST_SINGLE, None]
@@ -223,7 +224,7 @@ def _first_order(state: _State, part: slice) -> float:
     return float(state.right[part] @ np.linalg.solve(state.normal[part, part], state.right[part]))
 
 
-def _fit(film: NDArray[Any], fits: BallFits, curve: _State, noise: NoiseModel, others: Background) -> BallFits:
+def _fit(film: NDArray[Any], fits: BallFits, curve: _State, noise: NoiseModel, others: Images) -> BallFits:
     """Fit a group; the error of the curve is in its covariances."""
     optics, k = _optics(curve.common), len(fits.radius_px)
     one_light = _likelier(_group(film, fits, optics, noise, others), curve.common).group.one_light
@@ -240,7 +241,7 @@ def _optics(common: Float) -> Optics:
     return Optics(sigma, float(np.exp(common[1])) / sigma, (float(common[2]), float(common[3])))
 
 
-def _group(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, others: Background) -> _Group:
+def _group(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, others: Images) -> _Group:
     window = window_around(film, fits.position_px, fits.radius_px, optics.sigma_px, noise, others)
     weight = window.valid / noise.variance_at(window.raw)
     return _Group(window, weight, fits.position_px - window.corner_px, fits.radius_px)
