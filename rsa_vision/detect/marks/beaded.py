@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.find import plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.painted import Painted, paint
@@ -137,5 +138,5 @@ def _one_of(
 
 def _are_these(balls: BallFits, others: BallFits) -> Bool:
     """Say which balls are others, as they were before."""
-    gap = np.hypot(*(balls.position_px[:, None] - others.position_px).transpose(2, 0, 1))
+    gap = gaps(balls.position_px, others.position_px)
     return np.asarray((gap < others.radius_px).any(axis=1))

@@ -16,6 +16,7 @@ from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
 from rsa_vision.detect.balls.unlike import of_odd_size
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.marks.beaded import find_beaded
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.marks.noise_curve import noise_by_value
@@ -167,7 +168,7 @@ def _seen(needles: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
 def _long_places(mine: Candidates, looks: BallFits) -> Float:
     """Places (n, 2) at which the search answers along a line, likeliest first, less those at balls."""
     places, balls = _likeliest_first(mine.rows(mine.roundness < ROUNDNESS)), looks.rows(looks.explained > CLOSE)
-    gap = np.hypot(*(places[:, None] - balls.position_px).transpose(2, 0, 1))
+    gap = gaps(places, balls.position_px)
     return np.asarray(places[(gap > _BESIDE[0] * balls.radius_px + _BESIDE[1]).all(axis=1)])
 
 
@@ -336,7 +337,7 @@ def _are_rather_balls(film: NDArray[Any], tees: list[NeedleFit], seeds: BallFits
     """Say which tees a ball over their tip explains better: three thick arms that run into each other make a disc."""
     result = [False] * len(tees)
     tips = np.array([t.position_px for t in tees]).reshape(-1, 2)
-    gap = np.hypot(*(tips[:, None] - seeds.position_px[None]).transpose(2, 0, 1))
+    gap = gaps(tips, seeds.position_px)
     tee, seed = np.nonzero(gap < seeds.radius_px[None] + 1)
     if len(tee):
         balls = fit_at(film, seeds.position_px[seed], seeds.radius_px[seed], optics, noise, quick=True)

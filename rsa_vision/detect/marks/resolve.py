@@ -16,6 +16,7 @@ from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.balls.usual import over_kinds
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.places import gaps, on_film
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
@@ -185,7 +186,7 @@ def resolve_balls(
         )
     found = join([single.rows(slice(0)), *fits])
     found = found.rows(~_cancelled(found))
-    found = found.rows(inside(found, film) & ~_taken(found, drawn.fits))
+    found = found.rows(on_film(film, *found.position_px.T) & ~_taken(found, drawn.fits))
     balls = plausible(found, noise)
     alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
     perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
@@ -291,7 +292,7 @@ def doubt_of_number(fits: BallFits) -> Float:
 
 def _taken(fits: BallFits, good: BallFits) -> Bool:
     """Say which fits lie on a ball that is already known."""
-    gap = np.hypot(*(fits.position_px[:, None] - good.position_px[None]).transpose(2, 0, 1))
+    gap = gaps(fits.position_px, good.position_px)
     return np.asarray((gap < 0.6 * good.radius_px[None]).any(axis=1))
 
 
@@ -304,24 +305,18 @@ def _one_for_all(fits: BallFits, members: Int, noise: NoiseModel) -> list[int]:
 
 def _between(fits: BallFits, pairs: list[BallFits]) -> Bool:
     """Say which fits lie on both balls of a pair: they are what one ball explains of it."""
-    gaps = [np.hypot(*(fits.position_px[:, None] - pair.position_px).transpose(2, 0, 1)) / pair.radius_px for pair in pairs]
-    return np.asarray(np.any([gap.max(axis=1) < 1.0 for gap in gaps], axis=0))
+    off = [gaps(fits.position_px, pair.position_px) / pair.radius_px for pair in pairs]
+    return np.asarray(np.any([of_both.max(axis=1) < 1.0 for of_both in off], axis=0))
 
 
 def _like(fits: BallFits, known: BallFits) -> Bool:
     """Say which balls of a group are like those of the film that stand alone: two blobs can explain much that is none."""
     size = np.abs(np.log(fits.radius_px / np.median(known.radius_px))) < _LIKE
-    apart = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(size))
+    apart = gaps(fits.position_px, fits.position_px) + 99.0 * np.eye(len(size))
     size = size & (apart.min(1, initial=99.0) > 0.4 * fits.radius_px)  # two nearly in one place share its depth between them anyhow
     return np.asarray(
         size & (np.sign(fits.depth) == np.sign(np.median(known.depth))) & (np.abs(fits.depth) > 0.4 * np.median(np.abs(known.depth)))
     )
-
-
-def inside(fits: BallFits, film: NDArray[Any]) -> Bool:
-    """Say which centres lie on the film."""
-    col, row = fits.position_px.T
-    return np.asarray((col > -0.5) & (row > -0.5) & (col < film.shape[1] - 0.5) & (row < film.shape[0] - 0.5))
 
 
 def _unexplained_pairs(
@@ -342,8 +337,7 @@ def _unexplained_pairs(
     fine, peaks = fine[deep], peaks[deep]
     if len(peaks) == 0:
         return []
-    gaps = np.hypot(*(peaks[:, None] - good.position_px[None]).transpose(2, 0, 1))
-    free = (gaps > np.maximum(0.6 * typical, 0.9 * good.radius_px)).all(1)
+    free = (gaps(peaks, good.position_px) > np.maximum(0.6 * typical, 0.9 * good.radius_px)).all(1)
     out = []
     used = np.zeros(len(peaks), bool)
     for i in np.nonzero(free)[0]:
@@ -374,10 +368,10 @@ def _chain(peaks: Float, first: Int, free: Bool, own_px: float, neck_px: float, 
     """
     chain = first
     while len(chain) <= _COMPANY + 1:
-        nearest = np.hypot(*(peaks[:, None] - peaks[chain]).transpose(2, 0, 1)).min(axis=1)
+        nearest = gaps(peaks, peaks[chain]).min(axis=1)
         more = np.flatnonzero(free & (nearest < touch_px) & (nearest > own_px))
         if not len(more):
-            apart = np.hypot(*(peaks[chain][:, None] - peaks[chain]).transpose(2, 0, 1))
+            apart = gaps(peaks[chain], peaks[chain])
             links = apart[np.triu(apart < touch_px, 1)]
             return chain[1:] if len(links) < len(chain) and links.min(initial=np.inf) > neck_px else first[1:]
         chain = np.append(chain, more[nearest[more].argmin()])
@@ -389,7 +383,7 @@ def _is_bar(fits: BallFits, like: BallFits, touch_px: float, noise: NoiseModel) 
 
     A bar is explained nearly as well by some.
     """
-    apart = np.hypot(*(fits.position_px[:, None] - fits.position_px).transpose(2, 0, 1)) + 1e9 * np.eye(len(fits.depth))
+    apart = gaps(fits.position_px, fits.position_px) + 1e9 * np.eye(len(fits.depth))
     if len(apart) < LEAST_KNOWN or not (np.triu(apart, 1) > touch_px).any():
         return False
     left = misfit(fits, noise)

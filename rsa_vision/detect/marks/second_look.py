@@ -25,7 +25,7 @@ from rsa_vision.detect.balls.find import (
 )
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.marks.resolve import inside
+from rsa_vision.detect.film.places import gaps, on_film
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
@@ -111,7 +111,7 @@ class _Look:
 
     def may_be(self, fits: BallFits, known: BallFits) -> Bool:
         """Say which lie on the film and on no known ball."""
-        return inside(fits, self.film) & ~_near(fits.position_px, known, self.usual)
+        return on_film(self.film, *fits.position_px.T) & ~_near(fits.position_px, known, self.usual)
 
     def sure(self, fits: BallFits, known: BallFits) -> Bool:
         """Say which are as :func:`like_clear`."""
@@ -179,5 +179,5 @@ def _like_a_ball(fits: BallFits, limit: float, noise: NoiseModel, slack: float =
 
 
 def _near(position_px: Float, balls: BallFits, radius_px: float) -> Bool:
-    gap = np.hypot(*(position_px[:, None] - balls.position_px[None]).transpose(2, 0, 1))
+    gap = gaps(position_px, balls.position_px)
     return np.asarray((gap < np.maximum(radius_px, balls.radius_px)).any(axis=1))

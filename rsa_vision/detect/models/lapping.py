@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.types import Float
 
 FINE = 3  # samples along a pixel
@@ -20,7 +21,7 @@ _BLURS = 4.0  # beyond which the blurred product has faded
 def lapping(local: Float, radius: Float, beside_px: float = 0.0) -> list[tuple[int, int]]:
     """Return the pairs of balls whose shadows lie over each other, or as near, by their places (k, 2) and radii (k,)."""
     k = len(radius)
-    gap = np.hypot(*(local[:, None] - local[None]).transpose(2, 0, 1))
+    gap = gaps(local, local)
     over = gap < radius[:, None] + radius[None] - _STEP_PX + beside_px
     return [(i, j) for i in range(k) for j in range(i) if over[i, j]]
 

@@ -11,6 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
@@ -42,7 +43,7 @@ def clusters(needles: list[NeedleFit]) -> list[list[NeedleFit]]:
     if not needles:
         return []
     position = np.array([t.position_px for t in needles])
-    gap = np.hypot(*(position[:, None] - position[None]).transpose(2, 0, 1))
+    gap = gaps(position, position)
     length = np.array([t.shape.length_px for t in needles])
     reach = (length[:, None] + length[None]) * 1.02
     while True:  # arms that only just touch can do with subtraction, if joining them all would make too large a fit

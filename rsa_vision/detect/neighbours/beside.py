@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls.fits import BallFits, ball_image
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.types import Bool, Float, Int
@@ -23,15 +24,15 @@ def groups_of(fits: BallFits, optics: Optics) -> list[list[int]]:
     n = len(fits.depth)
     if n == 0:
         return []
-    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
-    touch = gap < fits.radius_px[:, None] + fits.radius_px[None] + TOUCH * optics.sigma_px
+    gap = gaps(fits.position_px, fits.position_px)
+    touch: Any = gap < fits.radius_px[:, None] + fits.radius_px[None] + TOUCH * optics.sigma_px
     _, label = connected_components(csr_array(touch), directed=False)
     return [np.nonzero(label == k)[0].tolist() for k in range(label.max() + 1)]
 
 
 def lapping_balls(fits: BallFits) -> Bool:
     """Say whose shadows lie over each other, shape (n, n); each over its own."""
-    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1))
+    gap = gaps(fits.position_px, fits.position_px)
     return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
 
 

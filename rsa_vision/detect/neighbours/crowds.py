@@ -12,6 +12,7 @@ from rsa_vision.detect.balls.decide import LEAST_KNOWN, look_clear
 from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, MISFIT, fit_at, misfit, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.beside import all_but, deep_at
@@ -63,7 +64,7 @@ def resolve_crowds(
     BallFits
         Those found, and the balls of crowds.
     """
-    apart = np.hypot(*(found.position_px[:, None] - found.position_px[None]).transpose(2, 0, 1))
+    apart = gaps(found.position_px, found.position_px)
     alone = (apart < found.radius_px[:, None] + found.radius_px + _ROOM * optics.sigma_px).sum(axis=1) == 1
     known = found.rows(look_clear(found, noise) & alone)
     if len(known.depth) < LEAST_KNOWN:
@@ -75,7 +76,7 @@ def resolve_crowds(
         return others(cols, rows), np.zeros(cols.shape, bool)
 
     place = candidates.position_px
-    gap = np.hypot(*(place[:, None] - found.position_px[None]).transpose(2, 0, 1))
+    gap = gaps(place, found.position_px)
     place = place[(gap > found.radius_px + 0.6 * radius).all(axis=1)]
     place = place[deep_at(film, place, radius, tees) > _DEEP * abs(depth)]
     if len(place) == 0:
@@ -102,7 +103,7 @@ def resolve_crowds(
 
 def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, tees: Images | None) -> BallFits:
     """Put a crowd to the balls found, fitted again together with those that it laps over."""
-    gap = np.hypot(*(found.position_px[:, None] - crowd.position_px[None]).transpose(2, 0, 1))
+    gap = gaps(found.position_px, crowd.position_px)
     near = (gap < found.radius_px[:, None] + crowd.radius_px).any(axis=1)
     if near.any():
         start = join([found.rows(near), crowd])
@@ -149,7 +150,7 @@ def _most_left(film: NDArray[Any], fits: BallFits, radius: float, optics: Optics
 
 def _all_balls(fits: BallFits, known: BallFits, noise: NoiseModel) -> bool:
     """Say whether these are like the film's clear balls, each in size and depth, and explain what they do as closely."""
-    gap = np.hypot(*(fits.position_px[:, None] - fits.position_px[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(fits.depth))
+    gap = gaps(fits.position_px, fits.position_px) + 99.0 * np.eye(len(fits.depth))
     usual = float(np.median(known.chi2_core))
     more = fits.chi2_core - usual
     more = np.where(more > CHANCE * noise.scatter(fits.n_core) * usual, more, 0.0)

@@ -14,6 +14,7 @@ from rsa_vision.detect.balls.find import distinct, no_fits
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import weighted_least_squares
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.models.lapping import fine_places
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
@@ -177,12 +178,12 @@ def look_on_arms(
     usual, depth = float(np.median(clear.radius_px)), float(np.median(np.abs(clear.depth)))
     sizes = np.full(len(place), usual)
     place = place[(painted.under(place, sizes) > OVER * depth) & ~painted.explain(film, place, sizes)]
-    place = place[(np.hypot(*(place[:, None] - known.position_px).transpose(2, 0, 1)) > usual).all(axis=1)]
+    place = place[(gaps(place, known.position_px) > usual).all(axis=1)]
     starts = _apart(place, _APART * usual)
     balls = fit_over(film, starts, np.full(len(starts), usual), known, optics, noise, painted)
     deep = np.sign(np.median(clear.depth)) * balls.depth > _DEEP * depth
     stays = np.hypot(*(balls.position_px - starts).T) < _STAYS * usual
-    free = (np.hypot(*(balls.position_px[:, None] - known.position_px).transpose(2, 0, 1)) > usual).all(axis=1)
+    free = (gaps(balls.position_px, known.position_px) > usual).all(axis=1)
     return distinct(balls.rows(like_clear(balls, known, limit, noise) & deep & stays & free), noise)
 
 

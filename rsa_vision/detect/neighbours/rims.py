@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.detect.film.places import on_film
 from rsa_vision.detect.models.shown import Beside
 from rsa_vision.types import Bool, Float, Int
 
@@ -56,11 +57,6 @@ def goes_on(film: NDArray[Any], balls: BallFits, number: Int, beside: Beside, si
         opposite = np.minimum(height, np.roll(height, len(_DIRECTIONS) // 2))
         out[i] = (narrow and height.max() > AS_HIGH) or opposite.max() > AS_HIGH
     return out
-
-
-def on_film(film: NDArray[Any], cols: Float, rows: Float) -> Bool:
-    """Say which places lie on the film."""
-    return np.asarray((cols > -0.5) & (cols < film.shape[1] - 0.5) & (rows > -0.5) & (rows < film.shape[0] - 0.5))
 
 
 def sample(film: NDArray[Any], cols: Float, rows: Float) -> Float:
