@@ -20,7 +20,8 @@ from rsa_vision.detect.needles import shared, tees
 from rsa_vision.detect.needles.arms import perhaps_arms
 from rsa_vision.detect.needles.ends import goes_on
 from rsa_vision.detect.needles.noise_along import noise_under_needles
-from rsa_vision.detect.needles.tees import GUESS, find_tees, first_tees, is_tee, optics_of_tees
+from rsa_vision.detect.needles.optics import GUESS
+from rsa_vision.detect.needles.tees import find_tees, first_tees, is_tee, optics_of_tees
 from rsa_vision.detect.search.candidates import find_candidates
 from rsa_vision.types import Float
 

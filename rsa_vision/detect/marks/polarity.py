@@ -21,9 +21,10 @@ from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.first_pins import look_for_pins
 from rsa_vision.detect.needles.noise_along import noise_under_needles
+from rsa_vision.detect.needles.optics import GUESS
 from rsa_vision.detect.needles.pins import on_pins, optics_of_pins
 from rsa_vision.detect.needles.pointed import is_slim
-from rsa_vision.detect.needles.tees import GUESS, first_tees, optics_of_tees
+from rsa_vision.detect.needles.tees import first_tees, optics_of_tees
 from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.search.candidates import STRENGTH, Candidates
 from rsa_vision.detect.search.junctions import ALONE

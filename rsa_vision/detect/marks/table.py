@@ -16,7 +16,7 @@ from rsa_vision.detect.balls.unlike import COMPANY, of_odd_size, too_deep, too_p
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.marks.resolve import doubt_of_number
 from rsa_vision.detect.marks.settle import STRUCTURE
-from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.needles import NeedleFit, wrapped
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.arms import lone_tees, meet_others, perhaps_arms
 from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, excess_of, significant_misfit
@@ -148,7 +148,7 @@ def table_of(
     marks = np.flatnonzero(~pale & ~poor[:n])  # what is none is no company for another's odd size
     odd = marks[of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])]
     flags[np.append(np.flatnonzero(pale | doubtful), odd)] |= MarkerFlag.UNLIKE
-    angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(np.angle(np.exp(1j * t.angles[0]))) for t in tees]])
+    angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(wrapped(t.angles[0])) for t in tees]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)

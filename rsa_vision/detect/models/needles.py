@@ -95,11 +95,21 @@ class NeedleFit:
     blurrier: float = 0.0
     edged: bool = False
 
+    @property
+    def way(self) -> Float:
+        """Step (col, row) of one pixel from the tip along the first arm."""
+        return np.array([np.cos(self.angles[0]), -np.sin(self.angles[0])])
+
     def seen_by(self, optics: Optics) -> Optics:
         """Return a film's optics with the blur of this needle, on a grid that has tables of its own."""
         if abs(self.blurrier) < _BLUR_GRID / 2:
             return optics
         return replace(optics, sigma_px=optics.sigma_px * math.exp(_BLUR_GRID * round(self.blurrier / _BLUR_GRID)))
+
+
+def wrapped(angles: Float) -> Float:
+    """Return angles, or what they differ by, as turns of half a circle at the most either way, radians."""
+    return np.asarray(np.angle(np.exp(1j * angles)))
 
 
 def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:

@@ -7,7 +7,7 @@ a function ``f(rho/sigma, r/sigma; mu sigma)`` of the distance ``rho`` alone, so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -64,6 +64,10 @@ class Optics:
     proportion: float = 0.0
     uneven: tuple[float, float] = (0.0, 0.0)
     rough: bool = False
+
+    def pooled(self, side: int) -> Optics:
+        """Return those of the film of which each pixel is the mean of a square of so many a side, which blurs it more."""
+        return replace(self, sigma_px=float(np.hypot(self.sigma_px, side / np.sqrt(12))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

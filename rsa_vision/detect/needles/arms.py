@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.needles import NeedleFit, wrapped
 from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.types import Bool, Float
 
@@ -36,7 +36,7 @@ def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
         arms = (near[:, 2, None] + [0.0, np.pi / 2, -np.pi / 2]).ravel()
         if few:
             arms = np.append(arms, tees[int(np.hypot(*(place - tip).T).argmin())].angles)
-        out[k] = np.abs(np.angle(np.exp(1j * (arms - angle)))).min(initial=np.inf) < _PARALLEL
+        out[k] = np.abs(wrapped(arms - angle)).min(initial=np.inf) < _PARALLEL
     return out
 
 
@@ -85,7 +85,7 @@ def lone_tees(needles: list[NeedleFit], sure: Bool) -> Bool:
     """
     tee = np.array([len(f.angles) > 1 for f in needles], bool)
     width, angle = np.log([f.shape.half_width_px for f in needles]), np.array([f.angles[0] for f in needles])
-    parallel = np.abs(np.angle(np.exp(1j * (angle[:, None] - angle)))) < _PARALLEL
+    parallel = np.abs(wrapped(angle[:, None] - angle)) < _PARALLEL
     alike = parallel & (np.abs(width[:, None] - width) < _AS_WIDE) & tee & sure
     alike[np.diag_indices(len(tee))] = True
     return np.asarray(tee & (alike.sum(axis=1) < LEAST_OF_A_KIND))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import EXPLAINED, MISFIT, SURE
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image
+from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image, wrapped
 from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
@@ -171,7 +171,7 @@ def _arms(model: NeedleFit, optics: Optics) -> list[tuple[NDArray[np.float32], s
     """Images of a tee's arms, each alone and less its mean, and where in the box around the tip they are."""
     reach = math.ceil((model.shape.length_px + 3 * optics.sigma_px) / SCALE) + _RIM
     cols_of, rows_of = np.meshgrid(*[SCALE * np.arange(-reach, reach + 1.0)] * 2)
-    coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, SCALE / np.sqrt(12))))
+    coarse = optics.pooled(SCALE)
     arms = []
     for k in range(len(model.angles)):
         shape = replace(model.shape, arms=model.shape.arms[k : k + 1] or model.shape.arms)
@@ -240,7 +240,7 @@ def _is_one(fit: NeedleFit, seen: Float) -> bool:
 
 def _is_like(fit: NeedleFit, known: list[NeedleFit]) -> bool:
     def unlike(tee: NeedleFit) -> float:
-        turn = float(np.angle(np.exp(1j * (fit.angles[0] - tee.angles[0]))))
+        turn = float(wrapped(fit.angles[0] - tee.angles[0]))
         longer, wider = math.log(fit.shape.length_px / tee.shape.length_px), math.log(fit.shape.half_width_px / tee.shape.half_width_px)
         return max(abs(turn) / _ALIKE, abs(longer) / _ALIKE, abs(wider) / _WIDE)
 

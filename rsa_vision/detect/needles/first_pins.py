@@ -9,18 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
-from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import explains, fit_needles, unfit
 from rsa_vision.detect.needles.laid_over import LIKENESS, laid_over
+from rsa_vision.detect.needles.optics import GUESS
 from rsa_vision.detect.needles.pointed import STANDS_OUT_ROUGHLY, same_body, turned, unexplained
 from rsa_vision.detect.needles.sets import NEAREST_PX, TAPERS, on_arms
 from rsa_vision.types import Float
 
 MOST_STROKES = 120  # strongest of a film, most of them seen by two filters
-_GUESS = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
 _ROUGH = 0.85  # explained by a first look, with guessed optics
 _MOST_IN_VAIN = 20  # strokes in a row that are no pins
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
@@ -58,7 +56,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
                 break
             start = NeedleShape(max(0.9, 0.5 * width), 1.45 * length, TAPERS[0])  # the answer fades before the tip
             tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
-            fits.append(fit_needles(film, tip, np.array([turn]), start, _GUESS, noise, quick=True))
+            fits.append(fit_needles(film, tip, np.array([turn]), start, GUESS, noise, quick=True))
         best = max(fits, key=lambda f: f.explained)
         if explains(best, _ROUGH, STANDS_OUT_ROUGHLY):
             found.append(best)
@@ -88,13 +86,13 @@ def likest_pins(film: NDArray[Any], places: Float, sign: int, noise: NoiseModel)
     shapes = [NeedleShape(width, ratio * width, TAPERS[1]) for width in _WIDTHS_PX for ratio in _RATIOS]
     pins = [replace(unfit(np.zeros(2), np.zeros(1), shape), depths=np.array([float(sign)])) for shape in shapes]
     out: list[NeedleFit] = []
-    for start in laid_over(film, places[:_MOST_PLACES], pins, _GUESS):
+    for start in laid_over(film, places[:_MOST_PLACES], pins, GUESS):
         if start.likeness < LIKENESS or len(out) == _MOST_FOUND:
             break
         if on_arms(start.place[None], out).any():
             continue
         ways = (start.pin.position_px, start.pin.angles), turned(start.pin)
-        fits = [fit_needles(film, *way, start.pin.shape, _GUESS, noise, quick=True) for way in ways]
+        fits = [fit_needles(film, *way, start.pin.shape, GUESS, noise, quick=True) for way in ways]
         best = max(fits, key=lambda f: f.explained)
         if explains(best, _ROUGH, STANDS_OUT_ROUGHLY) and best.depth * sign > 0:
             out.append(best_tapered(film, best, noise))
@@ -128,5 +126,5 @@ def best_tapered(film: NDArray[Any], first: NeedleFit, noise: NoiseModel) -> Nee
     fits = [first]
     for taper in (t for t in TAPERS if t != first.shape.taper):
         shape = replace(fits[-1].shape, taper=taper)
-        fits.append(fit_needles(film, fits[-1].position_px, fits[-1].angles, shape, _GUESS, noise, quick=True))
+        fits.append(fit_needles(film, fits[-1].position_px, fits[-1].angles, shape, GUESS, noise, quick=True))
     return min(fits, key=unexplained)

@@ -57,9 +57,9 @@ def errors_by_ground(
     """
     noise, members = through.noise, [f for e in systems for f in e.members]
     length = np.array([f.shape.length_px for f in needles])
-    middle = np.array([f.position_px for f in needles]) + 0.5 * length[:, None] * _ways(needles)
+    middle = np.array([f.position_px for f in needles]) + 0.5 * length[:, None] * np.array([f.way for f in needles])
     across = length * np.array([1.0 if len(f.angles) == 1 else 2.0 for f in needles])  # with the bar of a tee
-    way = _ways(members)
+    way = np.array([f.way for f in members])
     axes = np.stack([way, np.stack([-way[:, 1], way[:, 0]], axis=1)], axis=1)  # (members, 2, 2)
     counts = np.cumsum([0] + [len(e.members) for e in systems])
     angle = np.tile(_DIRECTIONS, len(_FARTHER)) + np.repeat(np.arange(len(_FARTHER)), len(_DIRECTIONS)) * np.pi / 8
@@ -93,7 +93,3 @@ def errors_by_ground(
     more = np.maximum(more, 0.0)
     extra = np.einsum("mb,mba,mbc->mac", more * np.concatenate(variances), axes, axes)
     return np.split(extra, counts[1:-1])
-
-
-def _ways(needles: Sequence[NeedleFit]) -> Float:
-    return np.array([[np.cos(f.angles[0]), -np.sin(f.angles[0])] for f in needles])

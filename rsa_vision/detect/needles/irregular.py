@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsa_vision.detect.balls.alike import true_spread
-from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.needles import NeedleFit, wrapped
 from rsa_vision.types import Float
 
 # logarithms of the lengths of stem and both halves of the bar, of the two ways in which they differ
@@ -50,7 +50,7 @@ def regular(sets: list[list[NeedleFit]]) -> Regularity:
 
 def ways_of(fit: NeedleFit, common: Float) -> Float:
     """Return how far a tee's arms differ from the common directions and from each other's lengths, shape (4,)."""
-    lean = np.angle(np.exp(1j * (fit.angles[1:] - fit.angles[0] - common)))
+    lean = wrapped(fit.angles[1:] - fit.angles[0] - common)
     logs = np.log(np.broadcast_to(fit.shape.arms, ARMS))
     return np.append(lean, [(2 * logs[0] - logs[1] - logs[2]) / 3, logs[1] - logs[2]])
 

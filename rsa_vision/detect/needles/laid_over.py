@@ -64,7 +64,7 @@ def laid_over(film: NDArray[Any], places: Float, pins: Sequence[NeedleFit], opti
     pixel = np.rint(places).astype(np.intp)
     best = np.full(len(places), -1.0)
     which = np.zeros((len(places), 2), np.intp)
-    coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, _SCALE / np.sqrt(12))))
+    coarse = optics.pooled(_SCALE)
     for k, pin in enumerate(pins):
         half = _SCALE * math.ceil((pin.shape.length_px + 2 * optics.sigma_px) / _SCALE)
         surface, images = _bare_images(pin, half, coarse)

@@ -6,12 +6,15 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.sets import clusters
 from rsa_vision.detect.needles.shared import fit_shared
 
+GUESS = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)  # before needles are asked
+BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)  # that are tried
 _SAMPLE = 18  # arms that are asked
 _STEPS = 4  # for a first estimate
 

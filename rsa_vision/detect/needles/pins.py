@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX
+from rsa_vision.detect.balls.optics import CAP
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
@@ -19,7 +19,7 @@ from rsa_vision.detect.needles.crossing import chi2_of, window_of
 from rsa_vision.detect.needles.first_pins import best_tapered, distinct, likest_pins
 from rsa_vision.detect.needles.fits import excess_of, fit_needles, significant_misfit
 from rsa_vision.detect.needles.of_a_kind import are_alike, are_of_a_kind, odd_lengths, others_like, without_company
-from rsa_vision.detect.needles.optics import common_optics
+from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
 from rsa_vision.detect.needles.pointed import (
     EXPLAINED,
     STANDS_OUT_ROUGHLY,
@@ -36,7 +36,6 @@ from rsa_vision.detect.needles.sets import MOST_TOGETHER, TAPERS, fit_all, on_ar
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.types import Bool, Float
 
-BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
 _OTHER_BLURS_PX = BLURS_PX[1::2]  # of pins on films whose balls have another
 _KNOWN = 0.12  # of its length, to which the tip of a pin is known even at CNR 5: trabeculae are pointed anyhow
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
@@ -187,10 +186,10 @@ def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel
         Significance of the pins.
     """
     if not rough:
-        return Optics(COARSE_SIGMA_PX, COARSE_MU_PX, rough=True), 0.0
-    trials = [Optics(sigma, COARSE_MU_PX, rough=True) for sigma in BLURS_PX]
+        return replace(GUESS, rough=True), 0.0
+    trials = [replace(GUESS, sigma_px=sigma, rough=True) for sigma in BLURS_PX]
     optics, _, sample = _likeliest(film, rough[:_SAMPLE], trials, noise)
-    return optics, float(sum(min(f.significance, 50.0) for f in sample if is_pin(f, noise)))
+    return optics, float(sum(min(f.significance, CAP) for f in sample if is_pin(f, noise)))
 
 
 def _likeliest(
@@ -279,5 +278,4 @@ def _less_sure_along(fit: NeedleFit, typical: float, odd_px: float, optics: Opti
     by_model = np.array([_OF_CURVE * optics.curve[0] ** 3, _OF_UNLIKE * optics.curve[0] * unlike, _OF_TAIL * optics.tail, by_rest])
     parts = [odd_px, _POINT * fit.shape.half_width_px, *(fit.shape.length_px * by_model)]
     error_px = float(np.linalg.norm(parts))
-    way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
-    return replace(fit, covariance_px2=fit.covariance_px2 + error_px**2 * np.outer(way, way))
+    return replace(fit, covariance_px2=fit.covariance_px2 + error_px**2 * np.outer(fit.way, fit.way))

@@ -57,8 +57,6 @@ def pointed(film: NDArray[Any], pins: list[NeedleFit], optics: Optics, noise: No
     film : ndarray of shape (rows, cols)
     pins : list of NeedleFit
         What may be pins, best first.
-    places : ndarray of shape (n, 2)
-        Where others of the kind of the clear ones may be, (col, row), likeliest first.
     optics : Optics
     noise : NoiseModel
 
@@ -122,8 +120,7 @@ def points_one_way(
 
 def turned(fit: NeedleFit) -> tuple[Float, Float]:
     """Tip and direction of the same pin the other way round."""
-    way = np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
-    return fit.position_px + fit.shape.length_px * way, fit.angles + np.pi
+    return fit.position_px + fit.shape.length_px * fit.way, fit.angles + np.pi
 
 
 def either_way(fit: NeedleFit) -> list[NeedleFit]:
@@ -135,7 +132,7 @@ def either_way(fit: NeedleFit) -> list[NeedleFit]:
 def surer_than_rod(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
     """Return half the chi2 by which a rod of free length, width and direction in the pin's place is worse."""
     thinner = replace(fit.shape, taper=_ROD, half_width_px=0.7 * fit.shape.half_width_px, length_px=0.8 * fit.shape.length_px)
-    back = fit.position_px + 0.2 * fit.shape.length_px * np.array([np.cos(fit.angles[0]), -np.sin(fit.angles[0])])
+    back = fit.position_px + 0.2 * fit.shape.length_px * fit.way
     return worse_by(film, fit, fit_needles(film, back, fit.angles, thinner, optics, noise), optics, noise)
 
 

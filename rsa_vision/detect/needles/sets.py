@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.places import gaps
-from rsa_vision.detect.models.needles import NeedleFit, needle_image
+from rsa_vision.detect.models.needles import NeedleFit, needle_image, wrapped
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import fit_crossing
@@ -97,15 +97,11 @@ def as_usual(tee: NeedleFit, others: list[NeedleFit]) -> NeedleFit:
     """Return a tee of the usual size of others, its arms meeting at the usual angles: something on one of them turns and stretches it."""
     if len(others) < LEAST_OF_A_KIND:
         return tee
-    usual = np.median([_turn(t.angles - t.angles[0]) for t in others], axis=0)
-    first = tee.angles[0] + np.median(_turn(tee.angles - tee.angles[0] - usual))
+    usual = np.median([wrapped(t.angles - t.angles[0]) for t in others], axis=0)
+    first = tee.angles[0] + np.median(wrapped(tee.angles - tee.angles[0] - usual))
     half_width, length = np.median([[t.shape.half_width_px, t.shape.length_px] for t in others], axis=0).tolist()
     shape = replace(others[0].shape, half_width_px=half_width, length_px=length)
     return replace(tee, angles=first + usual, shape=shape)
-
-
-def _turn(angles: Float) -> Float:
-    return np.asarray(np.angle(np.exp(1j * angles)))
 
 
 def on_arms(places: Float, needles: list[NeedleFit]) -> Bool:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.find import COARSE_MU_PX, COARSE_SIGMA_PX, EXPLAINED, MISFIT
+from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.balls.optics import CAP
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.places import gaps
@@ -24,7 +24,8 @@ from rsa_vision.detect.needles.crossing import chi2_of, fit_crossing, moved, win
 from rsa_vision.detect.needles.edges import beside_edges, proportion_of
 from rsa_vision.detect.needles.ends import goes_on
 from rsa_vision.detect.needles.fits import excess_of, explains, fit_needles
-from rsa_vision.detect.needles.optics import common_optics
+from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
+from rsa_vision.detect.needles.pointed import unexplained
 from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.detect.needles.templates import SCALE, find_like, promising, template_of
@@ -52,8 +53,6 @@ _LEAST_PARALLEL = 5  # tees of a film from which a common direction of the arms 
 _ALIKE, _MOST_ALIKE = (0.35, 0.2, 0.15), 0.7
 _ODD = 1.5  # times what is left under most tees of a film, from which something lies over one
 _ASKED = 3  # cleanest tees that tell blur and taper
-_BLURS_PX = (0.6, 0.8, 1.0, 1.25, 1.6, 2.1)
-GUESS = Optics(COARSE_SIGMA_PX, COARSE_MU_PX)
 CLEAN = 0.04  # what the model of a clean tee leaves at the most; then no other taper is tried
 
 
@@ -206,9 +205,9 @@ def optics_of_tees(film: NDArray[Any], cleanest: list[NeedleFit], noise: NoiseMo
         Significance of the tees that tell it; where there are none it is guessed.
     """
     # the very strongest are where arms cross, and of what is no tee the widest blur leaves least
-    windows = [window_of(film, [f], replace(GUESS, sigma_px=_BLURS_PX[-1]), noise, None) for f in cleanest]
+    windows = [window_of(film, [f], replace(GUESS, sigma_px=BLURS_PX[-1]), noise, None) for f in cleanest]
     fits, left = {}, {}
-    for sigma in _BLURS_PX:
+    for sigma in BLURS_PX:
         optics = replace(GUESS, sigma_px=sigma)
         fits[sigma] = [fit_needles(film, f.position_px, f.angles, f.shape, optics, noise) for f in cleanest]
         left[sigma] = sum(chi2_of(window, f, optics, noise) for window, f in zip(windows, fits[sigma], strict=True))
@@ -268,7 +267,7 @@ def _at_junctions(junctions: Float, taper: float, fitted_at: AtJunction) -> list
         clean = [f for f in rough if is_tee(f)]
         if len(clean) >= ENOUGH and not any(_turned(f, clean[0]) for f in clean):
             break
-    return sorted(rough, key=_left)
+    return sorted(rough, key=unexplained)
 
 
 def _at_junction(
@@ -283,17 +282,12 @@ def _at_junction(
         if is_tee(tried[-1]) or tried[0].explained < _ASKEW:
             break
     like = (f for f in tried if is_tee(f, slack=ROUGH) and f.depth * strength < 0)  # the answer has the other sign
-    return min(like, key=_left, default=None)
-
-
-def _left(fit: NeedleFit) -> float:
-    """What the model leaves."""
-    return fit.misfit + 1 - fit.explained
+    return min(like, key=unexplained, default=None)
 
 
 def _mean_misfit(fits: list[NeedleFit]) -> float:
     """Mean over the best few of what the model leaves; infinite for none."""
-    return float(np.mean([_left(f) for f in fits[:_ASKED]])) if fits else np.inf
+    return float(np.mean([unexplained(f) for f in fits[:_ASKED]])) if fits else np.inf
 
 
 def _like(film: NDArray[Any], models: list[NeedleFit], turned: list[NeedleFit], optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
@@ -356,7 +350,7 @@ def _peeled(
 
 def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
-    for fit in sorted(tees, key=_left):
+    for fit in sorted(tees, key=unexplained):
         deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > _FAINTEST * abs(model.depth)
         if deep and is_tee(fit, slack=ROUGH) and all(math.dist(fit.position_px, k.position_px) > NEAREST_PX for k in kept):
             kept.append(fit)

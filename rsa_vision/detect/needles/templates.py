@@ -6,7 +6,6 @@ show what one looks like, and the correlation with that image has a peak of its 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -33,7 +32,7 @@ def template_of(known: NeedleFit, optics: Optics) -> NDArray[np.float32]:
     """Return the image of a known tee at the resolution of the search; its middle pixel is the tip."""
     half = int(np.ceil(known.shape.length_px + 2 * optics.sigma_px + 2) // SCALE * SCALE)
     axis = SCALE * (np.arange(-half // SCALE, half // SCALE + 1, dtype=np.float64))
-    coarse = replace(optics, sigma_px=float(np.hypot(optics.sigma_px, SCALE / np.sqrt(12))))
+    coarse = optics.pooled(SCALE)
     return needle_image(*np.meshgrid(axis, axis), known, coarse).astype(np.float32)
 
 
