@@ -50,6 +50,11 @@ def true_spread(values: Float, variances: Float) -> tuple[float, float, Bool]:
     return float(np.average(centre, weights=likelihood)), float(np.sqrt(np.average(spread**2, weights=likelihood))), belongs
 
 
+def robust_sd(values: Float) -> float:
+    """Return the standard deviation of values that are normal but for a few, by how far they are from their median, (n,)."""
+    return SD_OF_MAD * float(np.median(np.abs(values - np.median(values))))
+
+
 def _robust_variance(offsets: Float, variances: Float) -> float:
     """Return the variance, beyond these, of which the median square is what it should be."""
 

@@ -114,7 +114,7 @@ def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, sigma_px: float
     -------
     ndarray of shape (n, ...)
     """
-    table = ball_table(round(mu_px * sigma_px, 3))
+    table = ball_table(sigma_px, mu_px)
     return table.evaluate(np.hypot(film_dx, film_dy) / sigma_px, radius_px / sigma_px)[0]
 
 
@@ -159,7 +159,7 @@ def fit_balls(
     stride = max(patches.size // _SPARSE_PX, 1) if sparse else 1
     n, size = len(start_px), patches.size
     half = size // 2
-    table = ball_table(round(mu_px * sigma_px, 3))
+    table = ball_table(sigma_px, mu_px)
     pixels = pixels_of(size, stride)
     values = patches.values.reshape(n, -1)
     level = values.mean(1)[:, None]
@@ -356,7 +356,7 @@ def derivatives(radius: Float, half: int, sigma_px: float, mu_px: float) -> Floa
     rows, cols = (
         np.repeat(axis.reshape(1, -1), len(radius), 0) for axis in np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
     )
-    value, *by = slopes(ball_table(round(mu_px * sigma_px, 3)), cols, rows, radius, sigma_px)
+    value, *by = slopes(ball_table(sigma_px, mu_px), cols, rows, radius, sigma_px)
     surface = polynomial(half, cols[0], rows[0]).T
     return np.concatenate([np.stack([*by, value], axis=1), np.broadcast_to(surface, (len(radius), *surface.shape))], axis=1)
 

@@ -207,7 +207,7 @@ def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Floa
             ball_image(dx, dy, one.radius_px, s, m) for s, m in ((sigma * h, mu / h), (sigma / h, mu * h), (sigma, mu * h), (sigma, mu / h))
         ]
         shared = np.stack([sides[0] - sides[1], sides[2] - sides[3]], 1) / (2 * _STEP)
-        value, by_dx, by_dy, by_radius = slopes(ball_table(round(mu * sigma, 3)), dx, dy, one.radius_px, sigma)
+        value, by_dx, by_dy, by_radius = slopes(ball_table(sigma, mu), dx, dy, one.radius_px, sigma)
         surface = polynomial(half, cols[0] - half, rows[0] - half).T
         depth, background = one.depth[:, None], one.background[:, None]
         of_ball = np.stack([value, depth * by_dx, depth * by_dy, depth * by_radius], 1)

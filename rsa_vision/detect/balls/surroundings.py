@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, polygamma
 
-from rsa_vision.detect.balls.alike import SD_OF_MAD
+from rsa_vision.detect.balls.alike import robust_sd
 from rsa_vision.detect.balls.fits import BallFits, half_size
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
@@ -163,8 +163,7 @@ def texture(places: list[Places], count: int, noise: NoiseModel) -> Texture:
     structure = around_each([e / (chdtri(freedom, 0.5) / freedom) for e in energies], places, count, 1.0) - 1.0
     both = [(e / (1 + structure[these.balls[these.near]])) @ freedom / freedom.sum() for e, these in zip(energies, places, strict=True)]
     logs = np.log(np.maximum(np.concatenate([np.ones(1), *both]), 1e-9))
-    scatter = SD_OF_MAD * float(np.median(np.abs(logs - np.median(logs))))
-    return Texture(structure, float(np.sqrt(max(scatter**2 - polygamma(1, 0.5 * freedom.sum()), _LEAST_DIFFER**2))))
+    return Texture(structure, float(np.sqrt(max(robust_sd(logs) ** 2 - polygamma(1, 0.5 * freedom.sum()), _LEAST_DIFFER**2))))
 
 
 def mean_beside(places: list[Places], count: int) -> Float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsa_vision.detect.balls.alike import SD_OF_MAD
+from rsa_vision.detect.balls.alike import robust_sd
 from rsa_vision.detect.balls.decide import LEAST_KNOWN
 from rsa_vision.types import Bool, Float, Int
 
@@ -74,9 +74,7 @@ def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> B
         if np.count_nonzero(told) < COMPANY:
             return pale
         part = np.log(depth[told] / usual[told])
-        middle = float(np.median(part))
-        spread = SD_OF_MAD * float(np.median(np.abs(part - middle)))
-        paler = depth + doubt < min(_SCATTERED, np.exp(middle - _APART * spread)) * usual
+        paler = depth + doubt < min(_SCATTERED, np.exp(float(np.median(part)) - _APART * robust_sd(part))) * usual
         if not (paler & ~pale).any():
             return pale
         pale |= paler

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsa_vision.detect.balls.alike import SD_OF_MAD, true_spread
+from rsa_vision.detect.balls.alike import robust_sd, true_spread
 from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.types import Float, Int
 
@@ -88,7 +88,7 @@ def over_kinds(radius_px: Float, known_px: Float, least: int) -> tuple[Float, Fl
         middle = float(np.median(known[kind]))
         larger = size >= middle
         over[larger] = size[larger] - middle
-        spread[larger] = SD_OF_MAD * float(np.median(np.abs(known[kind] - middle)))
+        spread[larger] = robust_sd(known[kind])
     return over, spread
 
 
@@ -191,7 +191,7 @@ def proportion_of_all(depth: Float, background: Float, beside: Float) -> tuple[f
         return 0.0, of_linear
     rank = np.argsort(np.argsort(beside)) - 0.5 * (len(beside) - 1)
     middle = float(np.median(depth))
-    far = _OUTLIER * SD_OF_MAD * float(np.median(np.abs(depth - middle)))
+    far = _OUTLIER * robust_sd(depth)
     depth = np.clip(depth, middle - far, middle + far)
     shared = float(rank @ background)
     if shared <= 0:

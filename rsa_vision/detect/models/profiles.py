@@ -135,19 +135,26 @@ class BallTable:
             self.made[block] = True
 
 
-@lru_cache(maxsize=64)
-def ball_table(mu_sigma: float) -> BallTable:
-    """Build the table for one attenuation.
+def ball_table(sigma_px: float, mu_px: float) -> BallTable:
+    """Return the table of balls of this blur and attenuation, which those of about as much attenuation along one blur width share.
 
     Parameters
     ----------
-    mu_sigma : float
-        Attenuation along one blur width: ``mu * sigma``. Large values make a disc, small ones half an ellipse.
+    sigma_px : float
+        Blur.
+    mu_px : float
+        Attenuation per pixel of chord.
 
     Returns
     -------
     BallTable
     """
+    return _table(round(mu_px * sigma_px, 3))
+
+
+@lru_cache(maxsize=64)
+def _table(mu_sigma: float) -> BallTable:
+    """Build a table; much attenuation along one blur width makes a disc, little half an ellipse."""
     blur = _blur()
     opacity = -np.expm1(-2 * mu_sigma * blur.half_chord)
     coarse = np.matmul(blur.kernel, (opacity * blur.weight)[:, :, None])[:, :, 0]

@@ -94,7 +94,7 @@ def _larger(radius_px: Float) -> Bool:
 def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
     """Differences of second moments, ``m cos(2 phi0)`` and ``m sin(2 phi0)`` in px^2 (n, 2), and their covariances."""
     halves = np.array([half_size(r, optics.sigma_px) for r in balls.radius_px])
-    table = ball_table(round(optics.mu_px * optics.sigma_px, 3))
+    table = ball_table(optics.sigma_px, optics.mu_px)
     out, covariance = np.zeros((len(halves), 2)), np.zeros((len(halves), 2, 2))
     for half in np.unique(halves):
         index = np.flatnonzero(halves == half)
