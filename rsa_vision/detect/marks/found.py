@@ -347,10 +347,10 @@ def _are_rather_balls(film: NDArray[Any], tees: list[NeedleFit], seeds: BallFits
     return result
 
 
-def _on_arms(balls: BallFits, tees: list[NeedleFit]) -> Bool:
-    """Say which balls are left-overs of the thick ends of tees."""
+def _on_arms(balls: BallFits, needles: list[NeedleFit]) -> Bool:
+    """Say which balls are left-overs of the thick ends of needles."""
     out = np.zeros(len(balls.depth), bool)
-    for t in tees:
+    for t in needles:
         dx, dy = (balls.position_px - t.position_px).T
         for angle, depth in zip(t.angles, t.depths, strict=True):
             c, s = np.cos(angle), -np.sin(angle)

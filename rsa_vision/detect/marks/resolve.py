@@ -117,13 +117,13 @@ def resolve_balls(
     if len(seeds.depth) == 0:
         none = np.zeros(0, bool)
         return Balls(seeds, none, none, none, none, np.zeros((0, 2, 2)), None)
-    tees: Images | None = needles
+    beside: Images | None = needles
     others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
     drawn = find_spot(film, single.rows(~clean), single.rows(clean), optics, noise, others)
     rest = ~_taken(single, drawn.fits)
-    single, clean, tees = single.rows(rest), clean[rest], with_spot(tees, drawn.fits, drawn.spot, optics)
+    single, clean, beside = single.rows(rest), clean[rest], with_spot(beside, drawn.fits, drawn.spot, optics)
     good = single.rows(plausible(single, noise, slack=1.5))
 
     def groups_worth_fitting() -> list[list[int]]:
@@ -134,12 +134,12 @@ def resolve_balls(
     clear = look_clear(good, noise)
     sized = bool(np.count_nonzero(clear) >= LEAST_KNOWN)
     like = good.rows(clear) if sized else good
-    for members in _unexplained_pairs(film, candidates, good, like, sized, optics, tees):
-        pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, tees)
+    for members in _unexplained_pairs(film, candidates, good, like, sized, optics, beside):
+        pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, beside)
         # one peak too many takes part of a ball, and then there is none
         while sized and len(pair.depth) > 2 and not _like(pair, like).all():
             others_px = pair.rows(np.arange(len(pair.depth)) != pair.significance.argmin()).position_px
-            fewer = fit_group(film, others_px, np.full(len(others_px), members[0, 2]), optics.sigma_px, optics.mu_px, noise, tees)
+            fewer = fit_group(film, others_px, np.full(len(others_px), members[0, 2]), optics.sigma_px, optics.mu_px, noise, beside)
             if np.count_nonzero(plausible(pair, noise)) < 2 and not (_like(fewer, like) & plausible(fewer, noise)).all():
                 break
             pair = fewer
@@ -148,11 +148,11 @@ def resolve_balls(
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     asked = clean & promising(single, limit, optics.sigma_px, noise) & ~hopeless(single, optics.sigma_px, noise)
     one_each = single.rows(asked)
-    clean[asked] = ~are_oblong(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, tees, *at), optics, noise)
+    clean[asked] = ~are_oblong(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, beside, *at), optics, noise)
     sure = single.rows(clean)
     blobs = single.rows(~clean & ~_taken(single, sure))
     split = len(sure.depth) > 0 or needles is None  # else what arms leave is all there is
-    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, tees)) if split else []
+    pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, beside)) if split else []
     fits += pairs
     if pairs:  # a blob that two balls explain is no ball
         good = good.rows(~_taken(good, join(pairs)) & ~_between(good, pairs))
@@ -161,7 +161,7 @@ def resolve_balls(
     for g in sorted(groups, key=len, reverse=True):  # those that touch first: the others are fitted beside their images
         index = np.array(g)
         if 1 < len(g) <= MOST_IN_GROUP:
-            near = all_but(known, index, optics, tees)
+            near = all_but(known, index, optics, beside)
             group = fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, near)
             tells = (plausible(group, noise) & ~_cancelled(group)).any()
             if not tells and (one := _one_for_all(good, index, noise)):
@@ -170,20 +170,14 @@ def resolve_balls(
             else:
                 fits.append(group)
         elif len(g) > MOST_IN_GROUP:
-            fits.append(_peel(film, good.rows(index), optics, noise, tees))
+            fits.append(_peel(film, good.rows(index), optics, noise, beside))
     if lone:
         known, alone = good.rows(there), (np.cumsum(there) - 1)[lone]
 
-        fits.append(
-            fit_at(
-                film,
-                known.position_px[alone],
-                known.radius_px[alone],
-                optics,
-                noise,
-                lambda i, *at: images_beside(known, alone[[i]], optics, tees, *at),
-            )
-        )
+        def neighbours(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+            return images_beside(known, alone[[i]], optics, beside, cols, rows)
+
+        fits.append(fit_at(film, known.position_px[alone], known.radius_px[alone], optics, noise, neighbours))
     found = join([single.rows(slice(0)), *fits])
     found = found.rows(~_cancelled(found))
     found = found.rows(on_film(film, *found.position_px.T) & ~_taken(found, drawn.fits))
@@ -191,10 +185,10 @@ def resolve_balls(
     alike = np.abs(np.log(found.radius_px[:, None] / like.radius_px)).min(axis=1, initial=np.inf) < _LIKE
     perhaps, found = found.rows(~balls & alike & plausible(found, noise, NEAR_EDGES)), found.rows(balls)
     found = found.rows(~_bar(found, misfit(found, noise, CHANCE) < DOUBTFUL * MISFIT))
-    found = resolve_crowds(film, candidates, distinct(found, noise), optics, noise, tees)
+    found = resolve_crowds(film, candidates, distinct(found, noise), optics, noise, beside)
     found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
-    found = without_lines(film, distinct(found, noise), limit, optics, noise, tees)
-    found, edged = beside_edges(film, found, optics, noise, tees)
+    found = without_lines(film, distinct(found, noise), limit, optics, noise, beside)
+    found, edged = beside_edges(film, found, optics, noise, beside)
     balls = plausible(found, noise)
     found, edged = found.rows(balls), edged[balls]
     of_spot, at_edge = _drawn_beside_edges(film, drawn, optics, noise, needles)
@@ -320,7 +314,7 @@ def _like(fits: BallFits, known: BallFits) -> Bool:
 
 
 def _unexplained_pairs(
-    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, sized: bool, optics: Optics, tees: Images | None
+    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, sized: bool, optics: Optics, beside: Images | None
 ) -> list[Float]:
     """Starts of groups, rows of (col, row, radius), at peaks off all known balls.
 
@@ -333,7 +327,7 @@ def _unexplained_pairs(
     peaks = candidates.position_px[fine]
     if len(peaks) == 0:
         return []
-    deep = deep_at(film, peaks, typical, tees) > 0.4 * np.median(np.abs(like.depth))
+    deep = deep_at(film, peaks, typical, beside) > 0.4 * np.median(np.abs(like.depth))
     fine, peaks = fine[deep], peaks[deep]
     if len(peaks) == 0:
         return []
@@ -391,13 +385,13 @@ def _is_bar(fits: BallFits, like: BallFits, touch_px: float, noise: NoiseModel) 
     return bool(unlike.any() or (apart.min(axis=1) < _NECKS * fits.radius_px).any())
 
 
-def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, tees: Images | None) -> BallFits:
+def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, beside: Images | None) -> BallFits:
     """Fit a large crowd one by one, each with the images of all others subtracted, until they settle."""
     for _ in range(4):
         last = fits
 
         def others(i: int, cols: Float, rows: Float, last: BallFits = last) -> tuple[Float, Bool]:
-            return images_beside(last, np.array([i]), optics, tees, cols, rows)[0], np.zeros(cols.shape, bool)
+            return images_beside(last, np.array([i]), optics, beside, cols, rows)[0], np.zeros(cols.shape, bool)
 
         fits = fit_at(film, fits.position_px, fits.radius_px, optics, noise, others)
     return fits

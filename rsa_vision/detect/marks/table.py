@@ -60,12 +60,12 @@ def table_of(
     touching: Bool,
     poor_ball: Bool,
     doubtful: Bool,
-    tees: list[NeedleFit],
+    needles: list[NeedleFit],
     junctions: Float,
     optics: Optics,
     noise: NoiseModel,
 ) -> tuple[MarkerImages, float]:
-    """Put balls and tees into one table, row by row of the film, with flags.
+    """Put balls and needles into one table, row by row of the film, with flags.
 
     Parameters
     ----------
@@ -77,13 +77,12 @@ def table_of(
     ratio : ndarray of shape (n,)
         Squared errors by their surroundings, as :func:`rsa_vision.detect.marks.settle.settle` tells.
     added : ndarray of shape (n + m, 2, 2)
-        Covariances of balls and tees, px^2, that no noise multiplies.
+        Covariances of balls and needles, px^2, that no noise multiplies.
     touching : ndarray of bool, shape (n + m,)
         Balls with something as dense beside them, and needles of which one hides a part.
     poor_ball, doubtful : ndarray of bool, shape (n,)
         Balls that the model does not describe; that may belong to the texture of the film.
-    tees : list of NeedleFit
-        And pins.
+    needles : list of NeedleFit
     junctions : ndarray of shape (k, 5)
         Of their polarity, as of :func:`rsa_vision.detect.search.junctions.find_junctions`.
     optics : Optics
@@ -96,8 +95,8 @@ def table_of(
         For marks of this polarity.
     """
     full = float(2**bits - 1)
-    n, m = len(balls.depth), len(tees)
-    position = np.concatenate([balls.position_px, np.array([t.position_px for t in tees]).reshape(-1, 2)])
+    n, m = len(balls.depth), len(needles)
+    position = np.concatenate([balls.position_px, np.array([t.position_px for t in needles]).reshape(-1, 2)])
     # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
     left = balls.chi2_uneven / usual
     excess = np.where(left > 1 + CHANCE * noise.scatter(balls.n_core), left, 1.0)
@@ -106,30 +105,30 @@ def table_of(
     covariance = np.concatenate(
         [
             balls.covariance[:, :2, :2] * excess[:, None, None],
-            np.array([t.covariance_px2 * excess_of(t, noise) for t in tees]).reshape(-1, 2, 2),
+            np.array([t.covariance_px2 * excess_of(t, noise) for t in needles]).reshape(-1, 2, 2),
         ]
     )
     covariance += added
-    radius = np.concatenate([balls.radius_px, [t.shape.half_width_px for t in tees]])
-    depth = np.abs(np.concatenate([balls.depth, [t.depth for t in tees]]))
-    background = np.concatenate([balls.background, [t.background for t in tees]])
+    radius = np.concatenate([balls.radius_px, [t.shape.half_width_px for t in needles]])
+    depth = np.abs(np.concatenate([balls.depth, [t.depth for t in needles]]))
+    background = np.concatenate([balls.background, [t.background for t in needles]])
     flags = np.zeros(n + m, np.int64)
-    reach = np.concatenate([balls.radius_px + 1, [t.shape.length_px for t in tees]])
+    reach = np.concatenate([balls.radius_px + 1, [t.shape.length_px for t in needles]])
     edge = (position < reach[:, None]).any(1) | (position[:, 0] > film.shape[1] - 1 - reach) | (position[:, 1] > film.shape[0] - 1 - reach)
     flags[edge] |= MarkerFlag.EDGE
-    valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in tees]])
+    valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in needles]])
     flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
-    flags[n:][[_noise_is_cut_off(t, noise) for t in tees]] |= MarkerFlag.SATURATED | MarkerFlag.CLIPPED
+    flags[n:][[_noise_is_cut_off(t, noise) for t in needles]] |= MarkerFlag.SATURATED | MarkerFlag.CLIPPED
     flags[touching] |= MarkerFlag.OVERLAP
-    arms = np.array([len(t.angles) for t in tees])
+    arms = np.array([len(t.angles) for t in needles])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), NEEDLES_ALIKE)
-    flags[n:][perhaps_arms(tees, junctions) | meet_others(film, tees) | (radius[n:] <= _LINE_PX)] |= MarkerFlag.UNLIKE
-    poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in tees]) > DOUBTFUL * MISFIT])
+    flags[n:][perhaps_arms(needles, junctions) | meet_others(film, needles) | (radius[n:] <= _LINE_PX)] |= MarkerFlag.UNLIKE
+    poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in needles]) > DOUBTFUL * MISFIT])
     if n >= COMPANY:  # among balls a pin or two are more likely ends of rods, and a tee or two are letters of lead
         few = np.count_nonzero(arms == 1) < LEAST_OF_A_KIND
-        flags[n:][((arms == 1) & few) | lone_tees(tees, ~poor[n:])] |= MarkerFlag.UNLIKE
+        flags[n:][((arms == 1) & few) | lone_tees(needles, ~poor[n:])] |= MarkerFlag.UNLIKE
     unknown = ~np.isfinite(covariance).all(axis=(1, 2))
     poor |= unknown
     covariance[unknown] = 0.0
@@ -148,8 +147,8 @@ def table_of(
     marks = np.flatnonzero(~pale & ~poor[:n])  # what is none is no company for another's odd size
     odd = marks[of_odd_size(balls.radius_px[marks], balls.covariance[marks, 2, 2])]
     flags[np.append(np.flatnonzero(pale | doubtful), odd)] |= MarkerFlag.UNLIKE
-    angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(wrapped(t.angles[0])) for t in tees]])
-    shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in tees], dtype="U4")
+    angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(wrapped(t.angles[0])) for t in needles]])
+    shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in needles], dtype="U4")
     snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
     # of what is small against the blur hardly any of its depth is seen; texture has specks as high as marks, and more that are none

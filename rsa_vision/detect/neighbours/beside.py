@@ -36,14 +36,14 @@ def lapping_balls(fits: BallFits) -> Bool:
     return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
 
 
-def all_but(known: BallFits, members: Int, optics: Optics, tees: Images | None) -> Images:
-    """Return the images of the tees and of all balls but ``members``, as a function of pixels (cols, rows)."""
-    return lambda cols, rows: images_beside(known, members, optics, tees, cols, rows)[0]
+def all_but(known: BallFits, members: Int, optics: Optics, needles: Images | None) -> Images:
+    """Return the images of the needles and of all balls but ``members``, as a function of pixels (cols, rows)."""
+    return lambda cols, rows: images_beside(known, members, optics, needles, cols, rows)[0]
 
 
-def images_beside(known: BallFits, members: Int, optics: Optics, tees: Images | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
-    """Return the images of the tees and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
-    total = np.zeros(cols.shape) if tees is None else tees(cols, rows)
+def images_beside(known: BallFits, members: Int, optics: Optics, needles: Images | None, cols: Float, rows: Float) -> tuple[Float, Bool]:
+    """Return the images of the needles and of all balls but ``members`` at these pixels, and the pixels well under one of those balls."""
+    total = np.zeros(cols.shape) if needles is None else needles(cols, rows)
     doubtful: Bool = np.zeros(cols.shape, np.bool_)
     reach = known.radius_px + 4 * optics.sigma_px
     low, high = (np.array([end(cols), end(rows)]) for end in (np.min, np.max))
@@ -68,14 +68,14 @@ def without_balls(film: NDArray[Any], balls: BallFits, optics: Optics) -> NDArra
     return out
 
 
-def deep_at(film: NDArray[Any], peaks: Float, radius: float, tees: Images | None) -> Float:
-    """How far the film less its tees differs at these places from the median of a ring well outside a ball there."""
+def deep_at(film: NDArray[Any], peaks: Float, radius: float, needles: Images | None) -> Float:
+    """How far the film less its needles differs at these places from the median of a ring well outside a ball there."""
     angle = 2 * np.pi * np.arange(16) / 16
     reach = 2 * radius + 3
     cols = np.rint(peaks[:, :1] + reach * np.cos(angle)).astype(np.intp).clip(0, film.shape[1] - 1)
     rows = np.rint(peaks[:, 1:] + reach * np.sin(angle)).astype(np.intp).clip(0, film.shape[0] - 1)
     col, row = np.rint(peaks).astype(np.intp).T
     middle = film[row.clip(0, film.shape[0] - 1), col.clip(0, film.shape[1] - 1)].astype(np.float64)
-    if tees is not None:
-        middle -= tees(*peaks.T)
+    if needles is not None:
+        middle -= needles(*peaks.T)
     return np.asarray(np.abs(middle - np.median(film[rows, cols], axis=1)))

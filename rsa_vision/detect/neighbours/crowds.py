@@ -43,7 +43,7 @@ def resolve_crowds(
     found: BallFits,
     optics: Optics,
     noise: NoiseModel,
-    tees: Images | None,
+    needles: Images | None,
 ) -> BallFits:
     """Explain what was left over by a few of the film's own balls.
 
@@ -56,7 +56,7 @@ def resolve_crowds(
         Balls of the film.
     optics : Optics
     noise : NoiseModel
-    tees : callable, optional
+    needles : callable, optional
         Images of pins and tees, to be subtracted.
 
     Returns
@@ -70,7 +70,7 @@ def resolve_crowds(
     if len(known.depth) < LEAST_KNOWN:
         return found
     radius, depth = float(np.median(known.radius_px)), float(np.median(known.depth))
-    others = all_but(found, np.arange(0), optics, tees)
+    others = all_but(found, np.arange(0), optics, needles)
 
     def others_of(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
         return others(cols, rows), np.zeros(cols.shape, bool)
@@ -78,7 +78,7 @@ def resolve_crowds(
     place = candidates.position_px
     gap = gaps(place, found.position_px)
     place = place[(gap > found.radius_px + 0.6 * radius).all(axis=1)]
-    place = place[deep_at(film, place, radius, tees) > _DEEP * abs(depth)]
+    place = place[deep_at(film, place, radius, needles) > _DEEP * abs(depth)]
     if len(place) == 0:
         return found
     single = fit_at(film, place, np.full(len(place), _START * radius), optics, noise, others_of, quick=True)
@@ -97,17 +97,17 @@ def resolve_crowds(
         if crowd is None:
             vain = np.concatenate([vain, at[None]])
         else:
-            found = _joined(film, found, crowd, optics, noise, tees)
+            found = _joined(film, found, crowd, optics, noise, needles)
     return found
 
 
-def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, tees: Images | None) -> BallFits:
+def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, needles: Images | None) -> BallFits:
     """Put a crowd to the balls found, fitted again together with those that it laps over."""
     gap = gaps(found.position_px, crowd.position_px)
     near = (gap < found.radius_px[:, None] + crowd.radius_px).any(axis=1)
     if near.any():
         start = join([found.rows(near), crowd])
-        others = all_but(found, np.flatnonzero(near), optics, tees)
+        others = all_but(found, np.flatnonzero(near), optics, needles)
         crowd = fit_group(film, start.position_px, start.radius_px, optics.sigma_px, optics.mu_px, noise, others)
         if not (plausible(crowd, noise) & (misfit(crowd, noise) < DOUBTFUL * MISFIT)).all():
             return found

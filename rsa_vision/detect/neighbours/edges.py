@@ -36,7 +36,7 @@ def beside_edges(
     fits: BallFits,
     optics: Optics,
     noise: NoiseModel,
-    tees: Images | None,
+    needles: Images | None,
     spot: Spot | None = None,
     *,
     wanted: Callable[[BallFits], Bool] | None = None,
@@ -53,7 +53,7 @@ def beside_edges(
         Of a film's balls; what is of no size that those have is dropped.
     optics : Optics
     noise : NoiseModel
-    tees : callable, optional
+    needles : callable, optional
         Images to be taken away first.
     spot : Spot, optional
         That draws the balls, if it is no Gaussian.
@@ -72,7 +72,7 @@ def beside_edges(
     for g in groups_of(fits, optics):
         index = np.array(g)
         edged_too.append(np.zeros(len(g), bool))
-        beside = all_but(fits, index, optics, tees)
+        beside = all_but(fits, index, optics, needles)
         plain = fits.rows(index)
         # a size at the limit is not fitted: nothing that comes to rest there is a ball
         if len(g) > MOST_IN_GROUP or not worth[index].any() or (plain.radius_px >= RADIUS_PX[1]).any():

@@ -31,7 +31,7 @@ _FAR = 1.5  # times the significance that a mark must have, for one that lies on
 _OF_ENDS = 3.0  # the same, that the end of a line may keep
 
 
-def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, tees: Images | None) -> BallFits:
+def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, needles: Images | None) -> BallFits:
     """Drop the parts of lines, and fit again what was fitted together with them.
 
     Parameters
@@ -43,14 +43,14 @@ def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Opti
         Significance that a mark must have.
     optics : Optics
     noise : NoiseModel
-    tees : callable, optional
+    needles : callable, optional
         Images to be taken away first.
 
     Returns
     -------
     BallFits
     """
-    lost = on_lines(film, fits, limit, optics, noise, tees)
+    lost = on_lines(film, fits, limit, optics, noise, needles)
     if not lost.any():
         return fits
     touched = np.zeros(len(lost), bool)
@@ -62,11 +62,11 @@ def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Opti
         index = np.array(g)
         if again[g].any():
             at = (kept.position_px[index], kept.radius_px[index], optics.sigma_px, optics.mu_px, noise)
-            parts.append(fit_group(film, *at, all_but(kept, index, optics, tees)))
+            parts.append(fit_group(film, *at, all_but(kept, index, optics, needles)))
     return join(parts)
 
 
-def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, tees: Images | None) -> Bool:
+def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, noise: NoiseModel, needles: Images | None) -> Bool:
     """Say which faint balls a line explains better, and add little to it.
 
     Both are judged by likelihood, in noise made white. A ball on a wire is more than that: it keeps its significance beside any profile.
@@ -79,7 +79,7 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
     limit : float
     optics : Optics
     noise : NoiseModel
-    tees : callable, optional
+    needles : callable, optional
         As of :func:`without_lines`.
 
     Returns
@@ -92,9 +92,9 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
     strong = fits.rows(full)
 
     def beside(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
-        return images_beside(strong, np.arange(0), optics, tees, cols, rows)
+        return images_beside(strong, np.arange(0), optics, needles, cols, rows)
 
-    others = all_but(strong, np.arange(0), optics, tees)
+    others = all_but(strong, np.arange(0), optics, needles)
     for i in np.flatnonzero(~full):
         of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], float(fits.radius_px[i]), optics, noise, others)[0]
         if of_line > of_ball:

@@ -103,7 +103,7 @@ def under_curve(
     groups: list[Int],
     optics: Optics,
     noise: NoiseModel,
-    tees: Images | None,
+    needles: Images | None,
 ) -> tuple[BallFits, Bool]:
     """Fit balls that lie over each other with the curve of the film, if it shows that it is bent.
 
@@ -121,7 +121,7 @@ def under_curve(
     optics : Optics
         Without a curve.
     noise : NoiseModel
-    tees : callable, optional
+    needles : callable, optional
         Images of pins and tees.
 
     Returns
@@ -132,11 +132,11 @@ def under_curve(
         Fitted so, on a background without an edge. To the errors of others without an edge is added by how much they would have moved.
     """
     changed, fitted = np.zeros(len(known.depth), bool), {name: getattr(known, name).copy() for name in _MEASURED}
-    curve = _told_curve(film, known, singles, groups, optics, noise, tees) if groups else None
+    curve = _told_curve(film, known, singles, groups, optics, noise, needles) if groups else None
     if curve is None:
         return known, changed
     for members in groups:
-        before, found = known.rows(members), _fit(film, known.rows(members), curve, noise, all_but(known, members, optics, tees))
+        before, found = known.rows(members), _fit(film, known.rows(members), curve, noise, all_but(known, members, optics, needles))
         apart = found.position_px - before.position_px
         there = bool((np.hypot(*apart.T) < _NEAR * (before.radius_px + optics.sigma_px)).all() and (found.valid_fraction > 0).all())
         if there and (_as_good(found, before) or (found.converged.all() and not edged[members].any())):
@@ -155,12 +155,12 @@ def _as_good(found: BallFits, before: BallFits) -> bool:
 
 
 def _told_curve(
-    film: NDArray[Any], known: BallFits, singles: Int, groups: list[Int], optics: Optics, noise: NoiseModel, tees: Images | None
+    film: NDArray[Any], known: BallFits, singles: Int, groups: list[Int], optics: Optics, noise: NoiseModel, needles: Images | None
 ) -> _State | None:
     """Ask balls for the curve of their film; as for :func:`under_curve`; None where the film does not show that it is bent."""
     best = singles[np.argsort(-known.significance[singles])][:_MOST_SINGLE, None]
     clearest = sorted(groups, key=lambda g: -float(known.significance[g].min()))[:_MOST_GROUPS]
-    asked = [_group(film, known.rows(g), optics, noise, all_but(known, g, optics, tees)) for g in [*best, *clearest]]
+    asked = [_group(film, known.rows(g), optics, noise, all_but(known, g, optics, needles)) for g in [*best, *clearest]]
     if len(asked) < _LEAST:
         return None
     each, start = float(noise.correlation.sum()), np.array([np.log(optics.sigma_px), np.log(optics.mu_px * optics.sigma_px), 0.0, 0.0])
