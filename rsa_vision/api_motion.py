@@ -22,7 +22,7 @@ from rsa_vision.motion_tables import (
     rigidity_table,
     write_motion_tables,
 )
-from rsa_vision.settings import Motion, Study, describe_validation, load_study
+from rsa_vision.settings import ROOM_C, Motion, Study, describe_validation, load_study
 from rsa_vision.store import read_run, write_atomic
 from rsa_vision.tables import SCHEMAS
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 UNNAMED: Final = "-"  # stands for the segment of markers without one
-ROOM_C: Final = 50.0  # as in the study file
 REMEDY: Final = "fill in the column segment, or give the known segments when measuring"
 
 

@@ -18,7 +18,6 @@ PACKAGES: Final = (
     "pydantic",
     "pydicom",
     "python-gdcm",
-    "scikit-image",
     "scipy",
     "tifffile",
 )

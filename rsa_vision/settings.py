@@ -15,7 +15,8 @@ Response = Literal["auto", "density", "transmission", "linear", "log"]
 Orientation = Literal["upright", "any", "mirrored"]
 FilmMode = Literal["shared", "separate"]
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]  # strict: true is no number, nor is "0.1"
-RoomC = Annotated[float, Field(ge=0, le=50, strict=True)]  # 74 (Fahrenheit) would scale a cage by 0.4 %, and nothing would show it
+ROOM_C: Final = 50.0  # warmest of a room: 74 (Fahrenheit) would scale a cage by 0.4 %, and nothing would show it
+RoomC = Annotated[float, Field(ge=0, le=ROOM_C, strict=True)]
 Vector = tuple[Finite, Finite, Finite]
 ORTHONORMAL: Final = 1e-3  # how well the axes of an anatomical frame must be at right angles
 
