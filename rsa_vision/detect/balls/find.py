@@ -14,7 +14,7 @@ from rsa_vision.detect.balls.fits import BallFits, fit_balls, half_size, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.models.shown import Beside
+from rsa_vision.detect.models.shown import Beside, beside_each
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
 
@@ -79,10 +79,8 @@ def fit_at(
         patches = cut(film, position_px[index], int(halves[index[-1]]), noise)
         extra = None
         if others is not None:
-            cols, rows = np.meshgrid(*[np.arange(float(patches.size))] * 2)
-            near = [others(i, cols + corner[0], rows + corner[1]) for i, corner in zip(index, patches.corner_px, strict=True)]
-            extra = np.stack([image for image, _ in near])
-            patches = replace(patches, valid=patches.valid & ~np.stack([doubtful for _, doubtful in near]))
+            extra, doubtful = beside_each(patches, index, others)
+            patches = replace(patches, valid=patches.valid & ~doubtful)
         start = (position_px[index], radius_px[index], halves[index])
         parts.append(fit_balls(patches, *start, optics, noise, extra, quick=quick, sparse=sparse))
     return join(parts).rows(np.argsort(order))

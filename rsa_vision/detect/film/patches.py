@@ -36,6 +36,11 @@ class Patches:
         """Side of the windows in pixels."""
         return int(self.values.shape[1])
 
+    def places(self, window: int) -> tuple[Float, Float]:
+        """Return the columns and rows on the film of the pixels of a window, shape (s, s)."""
+        cols, rows = np.meshgrid(*(np.arange(float(self.size)) + self.corner_px[window][:, None]))
+        return cols, rows
+
 
 def cut(film: NDArray[Any], centres_px: Float, half: int, noise: NoiseModel) -> Patches:
     """Cut windows of ``2 half + 1`` pixels around rounded centres.

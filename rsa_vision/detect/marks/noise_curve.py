@@ -81,7 +81,7 @@ def _squares(film: NDArray[Any], balls: BallFits, i: int, beside: Beside, optics
     """Film values expected under a ball, and squares of noise, made white, over what is taken for it; where opposites are seen too."""
     half = int(np.ceil(balls.radius_px[i] + 3 * optics.sigma_px)) + 1
     patches = cut(film, balls.position_px[[i]], half, noise)
-    cols, rows = np.meshgrid(*(np.arange(float(patches.size)) + patches.corner_px[0][:, None]))
+    cols, rows = patches.places(0)
     images, doubtful = beside(i, cols, rows)
     valid = (patches.valid[0] & ~doubtful).reshape(1, -1)
     dx, dy = (of.reshape(1, -1) - at for of, at in zip((cols, rows), balls.position_px[i], strict=True))

@@ -32,7 +32,7 @@ from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.shoulder import Curve, curve_of, shown, unseen_slope
 from rsa_vision.detect.marks.resolve import Balls
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.models.shown import Beside
+from rsa_vision.detect.models.shown import Beside, beside_each
 from rsa_vision.detect.neighbours.edges import OF_SHIFT
 from rsa_vision.detect.neighbours.foreign import foreign, in_line, robust_residual
 from rsa_vision.detect.neighbours.specks import Specks, find_specks, how_rough
@@ -217,10 +217,8 @@ def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: 
     fits = balls.rows(part)
     patches = cut(film, fits.position_px, half, noise)
     corner = patches.corner_px.astype(np.float64)
-    cols, rows = np.meshgrid(*[np.arange(float(patches.size))] * 2)
-    near = [beside(int(i), cols + c[0], rows + c[1]) for i, c in zip(part, corner, strict=True)]
-    doubtful = np.stack([there for _, there in near])
-    added = np.stack([image for image, _ in near]) + fits.background[:, None, None]
+    images, doubtful = beside_each(patches, part, beside)
+    added = images + fits.background[:, None, None]
     flat = (len(part), -1)
     return Windows(
         fits,

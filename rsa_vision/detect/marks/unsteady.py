@@ -202,7 +202,7 @@ def _of_ball(marks: Marks, i: int) -> _Window:
     balls, optics = marks.balls, marks.optics
     half = half_size(float(balls.radius_px[i]), optics.sigma_px)
     patches = cut(marks.film, balls.position_px[[i]], half, marks.noise)
-    cols, rows = np.meshgrid(*(np.arange(float(patches.size)) + patches.corner_px[0][:, None]))
+    cols, rows = patches.places(0)
     others, doubtful = images_beside(balls, np.array([i]), optics, marks.painted, cols, rows)
     dx, dy = ((of - at).reshape(1, -1) for of, at in zip((cols, rows), balls.position_px[i], strict=True))
     value, *by = (shape.astype(np.float64) for shape in shapes_of(optics, None, dx, dy, balls.radius_px[[i]]))
@@ -215,7 +215,7 @@ def _of_needle(marks: Marks, fit: NeedleFit) -> _Window:
     optics = marks.optics
     half = int(np.ceil(fit.shape.length_px + fit.shape.half_width_px + _FADED * optics.sigma_px)) + 1
     patches = cut(marks.film, fit.position_px[None], half, marks.noise)
-    cols, rows = np.meshgrid(*(np.arange(float(patches.size)) + patches.corner_px[0][:, None]))
+    cols, rows = patches.places(0)
     others, doubtful = images_beside(marks.balls, np.zeros(0, np.intp), optics, marks.painted, cols, rows)
     dx, dy = ((of - at).ravel() for of, at in zip((cols, rows), fit.position_px, strict=True))
     mine = needle_image(dx, dy, fit, optics)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
+import numpy as np
+
+from rsa_vision.detect.film.patches import Patches
 from rsa_vision.types import Bool, Float
 
 Images = Callable[[Float, Float], Float]
@@ -11,3 +14,9 @@ Images = Callable[[Float, Float], Float]
 
 Beside = Callable[[int, Float, Float], tuple[Float, Bool]]
 """Images of all marks but one ball at pixels (cols, rows) around it, in film values, and the pixels where they are not to be trusted."""
+
+
+def beside_each(patches: Patches, balls: Iterable[int], beside: Beside) -> tuple[Float, Bool]:
+    """Return the same for a window of each of some balls, which ``beside`` calls by these numbers; both of shape (n, s, s)."""
+    images, doubtful = zip(*(beside(int(ball), *patches.places(k)) for k, ball in enumerate(balls)), strict=True)
+    return np.stack(images), np.stack(doubtful)

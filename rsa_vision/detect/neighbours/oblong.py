@@ -17,7 +17,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.profiles import Optics, ball_table
-from rsa_vision.detect.models.shown import Beside
+from rsa_vision.detect.models.shown import Beside, beside_each
 from rsa_vision.types import Bool, Float
 
 _LEAST = 0.08  # of the squared radius, the difference of second moments; two balls 0.4 diameters apart make twice that
@@ -101,9 +101,8 @@ def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optic
         fits, side = balls.rows(index), 2 * int(half) + 1
         patches = cut(film, fits.position_px, int(half), noise)
         rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1).astype(np.float64)
-        near = [beside(int(i), cols + c, rows + r) for i, (c, r) in zip(index, patches.corner_px, strict=True)]
-        data = patches.values.reshape(len(index), -1) - np.stack([image for image, _ in near])
-        valid = patches.valid.reshape(len(index), -1) & ~np.stack([doubtful for _, doubtful in near])
+        near, doubtful = beside_each(patches, index, beside)
+        data, valid = (patches.values - near).reshape(len(index), -1), (patches.valid & ~doubtful).reshape(len(index), -1)
         dx, dy = (axis - at[:, None] for axis, at in zip((cols, rows), (fits.position_px - patches.corner_px).T, strict=True))
         value, *by = slopes(table, dx, dy, fits.radius_px, optics.sigma_px)
         square = np.maximum(dx**2 + dy**2, 1e-9)

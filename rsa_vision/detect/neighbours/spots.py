@@ -22,7 +22,7 @@ from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.profiles import Optics, ball_table
-from rsa_vision.detect.models.shown import Beside, Images
+from rsa_vision.detect.models.shown import Beside, Images, beside_each
 from rsa_vision.detect.neighbours.blobs import LEAST_GAIN
 from rsa_vision.detect.neighbours.double_images import gain_over_two
 from rsa_vision.types import Bool, Float
@@ -203,8 +203,8 @@ def _window(film: NDArray[Any], balls: BallFits, half: int, others: Beside | Non
     rows, cols = np.mgrid[0 : patches.size, 0 : patches.size].astype(np.float64)
     added, valid = np.zeros((n, *cols.shape)), patches.valid
     if others is not None:
-        near = [others(i, cols + c[0], rows + c[1]) for i, c in enumerate(corner)]
-        added, valid = np.stack([image for image, _ in near]), valid & ~np.stack([doubtful for _, doubtful in near])
+        added, doubtful = beside_each(patches, range(n), others)
+        valid = valid & ~doubtful
     surface = polynomial(half, cols.ravel() - half, rows.ravel() - half).T
     flat = (n, -1)
     data = (patches.values - added).reshape(flat)
