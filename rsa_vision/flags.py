@@ -28,7 +28,7 @@ class MarkerFlag(IntFlag):
     FOREIGN_MARK = 2048  # a cage mark that this focus is not meant to see; explained, not used
     LOOSE = 4096  # not where the other markers of its rigid body say
     MISSING = 8192  # a marker that the subject has, of which nothing was found here
-    UNLIKE = 16384  # of an odd size, too pale, parallel to an arm of a tee, in a hole, or lost among texture: of another kind, or none
+    UNLIKE = 16384  # of an odd size, too pale, parallel to an arm of a tee, in a hole or a row, lost in texture: of another kind, or none
 
 
 def flag_names(value: int) -> str:

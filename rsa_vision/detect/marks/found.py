@@ -41,6 +41,7 @@ from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.neighbours.laid_on import fit_over, look_on_arms, over_arms
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.neighbours.rims import goes_on
+from rsa_vision.detect.neighbours.rows import in_rows
 from rsa_vision.detect.neighbours.under_curve import under_curve
 from rsa_vision.detect.search.candidates import STRENGTH, Candidates
 from rsa_vision.types import Bool, Float, Int, MarkerImages
@@ -97,7 +98,7 @@ def marks_of(
         needles = beaded
         found, tees = _find_balls(film, mine, faint, needles, seen, limit, mottled=mottled)
     needles = replace(needles, tees=tees)
-    around = _around(film, found, needles, seen.optics, seen.noise)
+    around = _around(film, found, needles, seen)
     if around.under > _MUCH_MORE and seen.noise.blur_px > _SMOOTHED * seen.optics.sigma_px:
         rougher = replace(seen, noise=seen.noise.blurred_by(_USUAL_BLUR * seen.optics.sigma_px))
         return marks_of(film, bits, rougher, rough_pins, candidates, faint, limit, mottled=mottled)
@@ -131,14 +132,15 @@ def _find_needles(
     film: NDArray[Any], mine: Candidates, faint: Candidates, all_strokes: Float, rough_pins: list[NeedleFit], seen: Seen
 ) -> _Needles:
     sign, optics, noise = seen.sign, seen.optics, seen.noise
+    round_ones = join([seen.looks, seen.rowed])
     tees, doubtful, tee_optics = find_tees(film, mine.junctions, faint.strokes, optics, noise)
     tees = [fit for fit in tees if np.sign(fit.depth) == sign]
-    tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, seen.looks, optics, noise), strict=True) if not ball]
+    tees = [fit for fit, ball in zip(tees, _are_rather_balls(film, tees, round_ones, optics, noise), strict=True) if not ball]
     perhaps = [*tees, *doubtful] if len(tees) >= LEAST_KNOWN else tees  # whose arms are no pins
     more_pins = look_for_pins(film, all_strokes[~on_arms(all_strokes[:, :2], perhaps)], noise)
     rough_pins = [p for p in rough_pins + more_pins if np.sign(p.depth) == sign]
     places = _likeliest_first(faint)
-    lines = _long_places(mine, seen.looks)
+    lines = _long_places(mine, round_ones)
     pins, pin_optics = find_pins(film, rough_pins, places[~on_arms(places, perhaps)], lines, perhaps, sign, optics, noise)
     tees, pins = [_seen(tees, noise), _seen([p for p in pins if is_located(p)], noise)]
     painted = _painted(tees, pins, tee_optics, pin_optics)
@@ -260,19 +262,23 @@ class _Around:
     """Film around the balls, and what these say of its noise."""
 
     places: list[Places]
-    free: Bool  # (n,): balls fitted alone
+    rowed: Bool  # (n,): in rows, as no markers are
+    free: Bool  # (n,): other balls fitted alone
     clear: Int  # those of them with nothing on them or beside them, and no other spot than the Gaussian
     under: float  # variance of the noise under balls, in units of that beside them
 
 
-def _around(film: NDArray[Any], found: Balls, needles: _Needles, optics: Optics, noise: NoiseModel) -> _Around:
-    known, others = found.fits, needles.all
+def _around(film: NDArray[Any], found: Balls, needles: _Needles, seen: Seen) -> _Around:
+    known, others, optics, noise = found.fits, needles.all, seen.optics, seen.noise
     place = np.array([t.position_px for t in others]).reshape(-1, 2)
     reach = np.array([t.shape.length_px + t.shape.half_width_px + 3 * optics.sigma_px for t in others])
     places = free_places(film, known, place, reach, optics, noise)
-    free = ~found.touching & ~found.crossed
+    every = join([known, seen.rowed])  # those that were found may be a few of a row only
+    rowed = in_rows(every.position_px, every.radius_px, every.depth)[: len(known.depth)]
+    free = ~(found.touching | found.crossed | rowed)
     clear = np.flatnonzero(free & ~found.drawn & (known.valid_fraction > WHOLE) & (known.chi2_ring < STRUCTURE))
-    return _Around(places, free, clear, noise_under(known.chi2_uneven[clear], known.radius_px[clear], STRUCTURE, places, optics, noise))
+    under = noise_under(known.chi2_uneven[clear], known.radius_px[clear], STRUCTURE, places, optics, noise)
+    return _Around(places, rowed, free, clear, under)
 
 
 def _measured(
@@ -297,16 +303,19 @@ def _measured(
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
         touching = touching | over_arms(balls, painted)
     left, poor = what_is_left(balls, under, optics.sigma_px, noise)
+    lone = np.flatnonzero(~around.rowed)  # these alone say what balls are like
+    single = balls.rows(lone)
+    poor[lone] = what_is_left(single, under, optics.sigma_px, noise)[1]
     poor |= covered
     keep = left < _BENT * MISFIT
     ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
     keep &= ~(poor & ends)
-    poor |= are_oblong(film, balls, beside, optics, noise)
+    poor[lone] |= are_oblong(film, single, lambda i, *at: beside(int(lone[i]), *at), optics, noise)
     touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
-    balls, ratio, touching, poor = balls.rows(keep), ratio[keep], touching[keep], poor[keep]
+    balls, ratio, touching, poor, rowed = balls.rows(keep), ratio[keep], touching[keep], poor[keep], around.rowed[keep]
     added = added[np.append(keep, np.ones(len(others), bool))]
-    poor = np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
-    doubtful = lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
+    poor = rowed | np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
+    doubtful = rowed | lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
     # a pin has one arm: what hides a part of it is felt at its tip
     touching = np.concatenate([touching, np.zeros(len(needles.tees), bool), lapped(needles.pins, balls, optics)])
     return table_of(film, bits, balls, under, ratio, added, touching, poor, doubtful, others, faint.junctions, optics, noise)

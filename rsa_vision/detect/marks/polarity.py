@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, faint_beside, height_of
+from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, faint_beside, height_of, look_clear
 from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, ROUNDNESS, distinct, first_look
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import BESIDE_NEEDLES, noise_at_marks
@@ -26,6 +26,7 @@ from rsa_vision.detect.needles.pins import on_pins, optics_of_pins
 from rsa_vision.detect.needles.pointed import is_slim
 from rsa_vision.detect.needles.tees import first_tees, optics_of_tees
 from rsa_vision.detect.neighbours.holes import are_holes
+from rsa_vision.detect.neighbours.rows import in_rows
 from rsa_vision.detect.search.candidates import STRENGTH, Candidates
 from rsa_vision.detect.search.junctions import ALONE
 from rsa_vision.flags import MarkerFlag
@@ -56,6 +57,8 @@ class Seen:
         Of depth: negative for marks darker than their surroundings.
     looks : BallFits
         First looks at what may be balls.
+    rowed : BallFits
+        Those in rows, as threads of screws make them: they do not say what balls of the film are like.
     optics : Optics
     noise : NoiseModel
         With that at marks of this polarity.
@@ -69,6 +72,7 @@ class Seen:
 
     sign: int
     looks: BallFits
+    rowed: BallFits
     optics: Optics
     noise: NoiseModel
     weight: float
@@ -201,12 +205,13 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
     junctions = candidates.junctions[-sign * candidates.junctions[:, 4] > 0]
     clear = junctions[np.abs(junctions[:, 4]) > CLEAR_JUNCTION]
     round_ones = candidates.rows((np.sign(candidates.strength) == -sign) & (candidates.roundness > ROUNDNESS))
+    looks, rowed = _off_rows(looks, noise)
     # parts of arms leave what no ball does, and that is no noise
     arms = _at_junctions(looks.position_px, junctions if len(clear) else clear) & (looks.explained < CLOSE)
     under = noise_at_marks(film, looks.rows(~arms), noise, *[BESIDE_NEEDLES] * bool(len(clear) or slim))
     if under is not noise:  # not all that was unlike a ball in less noise is none
         looks = distinct(_look(film, round_ones, pins, under), under)
-        looks = looks.rows(~faint_beside(looks, slim, COARSE_SIGMA_PX, under))
+        looks, rowed = _off_rows(looks.rows(~faint_beside(looks, slim, COARSE_SIGMA_PX, under)), under)
     optics, balls = estimate_optics(film, looks, under)
     pairs = None if len(clear) else optics_of_pairs(film, round_ones, looks, optics, under)
     if pairs is not None:
@@ -227,7 +232,15 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
             if needles > 0 or not len(looks.depth):  # else even one faint ball knows more of its blur than nobody
                 optics = of_pins
     meet = np.count_nonzero(np.abs(junctions[:, 4]) > ALONE) >= _A_SET
-    return Seen(sign, looks, optics, under, balls + needles + _of_tees(candidates, sign), junctions=bool(meet))
+    return Seen(sign, looks, rowed, optics, under, balls + needles + _of_tees(candidates, sign), junctions=bool(meet))
+
+
+def _off_rows(looks: BallFits, noise: NoiseModel) -> tuple[BallFits, BallFits]:
+    """Part first looks into others and those in rows, unless too few of the others show what balls are like."""
+    rowed = in_rows(looks.position_px, looks.radius_px, looks.depth)
+    if np.count_nonzero(look_clear(looks.rows(~rowed), noise)) < LEAST_KNOWN:
+        rowed[:] = False
+    return looks.rows(~rowed), looks.rows(rowed)
 
 
 def likelier(found: list[MarkerImages], evidence: list[float]) -> tuple[int, bool]:
