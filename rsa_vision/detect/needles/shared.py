@@ -65,6 +65,8 @@ _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much the
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
 _CURVE_ERROR, _CURVE_OF_PINS_ERROR, _TAIL_ERROR = (0.6, 0.1), (1.0, 0.1), 0.07
+# tail below which a film may have been sharpened, by how much less it surely was, and error of a pin's tip by that in units of the blur
+_OF_LIGHT, _OF_LIGHT_ERROR, _BY_SHARPENING = -0.1, 0.1, 0.8
 _ENOUGH_PINS = 3  # that tell what comes after the film curve
 _PIXEL, _MOST_PIXEL = 1 / 12, 0.5  # px^2 of blur by the area of a scanner's pixel, and part of the variance that it may be at first
 _LATE_ERROR, _LOGGED_ERROR, _FIXED = 0.15, 2.5, 1e-3  # of what comes after the film curve, of the logarithm there, of either where it stays
@@ -251,7 +253,9 @@ def fit_shared(
     by_ground = errors_by_ground(film, windows, systems, tips, out, through)
     over = [louder(w, e, own, change, optics.sigma_px) for w, e, own in zip(windows, systems, step.own, strict=True)]
     more = _more(out, np.concatenate(by_ground), tips, over, noise)
-    return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, more, strict=True)], optics
+    return [
+        replace(f, covariance_px2=f.covariance_px2 + extra + _by_sharpening(f, optics)) for f, extra in zip(out, more, strict=True)
+    ], optics
 
 
 def _telling(sets: list[list[NeedleFit]], noise: NoiseModel) -> list[bool]:
@@ -349,6 +353,15 @@ def _common_errors(systems: list[Equations], by_noise: list[Float], normal: Floa
     inverse = np.linalg.inv(normal)
     covariance: Float = inverse @ spread @ inverse
     return covariance
+
+
+def _by_sharpening(needle: NeedleFit, optics: Optics) -> Float:
+    """Covariance (2, 2) of the tip of a pin on a film that was sharpened: no light has a negative tail, and what stands in for it bends."""
+    if len(needle.angles) > 1:  # the others hold it
+        return np.zeros((2, 2))
+    amount = between((_OF_LIGHT - optics.tail) / _OF_LIGHT_ERROR, 0.0, 1.0)
+    along = np.array([np.cos(needle.angles[0]), -np.sin(needle.angles[0])])
+    return (amount * _BY_SHARPENING * optics.sigma_px) ** 2 * np.outer(along, along)
 
 
 def _finished(
