@@ -20,6 +20,7 @@ _LOW = 0.25  # quantile of the film's needles that are compared
 UNEXCUSED = 0.5  # those below that have to fit closely
 EDGE = 16.0  # more variance than this around a ball, in units of the noise, is an edge beside it; edges do not look like balls
 SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on the scanner, not a blurred ball
+_LEAST_ROUND_PX = 1.0  # radius from which four pixels are seen of, or more: one pixel has any form
 LEAST_KNOWN = 3  # balls that tell what one of them is like on this film
 _COMPANY = 6  # sure ones of one size that stand for each other where none is clear enough for a pattern
 _LIKE = 1.25  # images whose spreads are within this factor are of one size
@@ -119,7 +120,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     """
     strength, height = over_clutter(fits), height_of(fits, sigma_px)
     seen = noise.rises_above(height, fits.background)
-    sure, close = _are_sure(fits, limit, sigma_px) & seen, misfit(fits, noise) < MISFIT
+    sure, close = _are_sure(fits, limit, sigma_px, noise) & seen, misfit(fits, noise) < MISFIT
     pattern, radii = _pattern(fits, sure & close, sigma_px)
     if len(radii) < LEAST_KNOWN:
         # noise hides what marks are like here: those without company have to be clearer, and among structure noise is no excuse
@@ -147,12 +148,16 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
 
 def show_what_marks_are_like(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> bool:
     """Say whether some balls are so clear that they tell what others of the film are like; as for :func:`are_balls`."""
-    clear = _are_sure(fits, limit, sigma_px) & (misfit(fits, noise) < MISFIT)
+    clear = _are_sure(fits, limit, sigma_px, noise) & (misfit(fits, noise) < MISFIT)
     return len(_pattern(fits, clear, sigma_px)[1]) >= LEAST_KNOWN
 
 
-def _are_sure(fits: BallFits, limit: float, sigma_px: float) -> Bool:
-    spot = _spread(fits, sigma_px) < SPOT_PX
+def _are_sure(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:
+    spread = _spread(fits, sigma_px)
+    spot = spread < SPOT_PX
+    # faulty pixels and dust are of any form: what sharpened films show of small balls is round, each like the next
+    ball = spot & look_clear(fits, noise) & (misfit(fits, noise) < DOUBTFUL * MISFIT) & (fits.radius_px > _LEAST_ROUND_PX)
+    spot &= ~(ball & (_of_like_spread(spread, ball) >= _COMPANY))
     # what would be larger still than the fit may go is no ball of that size
     return np.asarray((over_clutter(fits) > max(SURE, limit)) & ~spot & (fits.radius_px < RADIUS_PX[1]))
 
