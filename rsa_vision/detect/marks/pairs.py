@@ -24,6 +24,7 @@ _MOST = 100  # seeds among which single balls are looked for
 _STRONGEST = 24  # candidates that are asked where there is no seed
 _FEW = 8  # of the seeds, asked first
 _ASKED, _AT_FIRST = 4, 2  # surest blobs; those asked while the blur is anybody's
+_ROUGHLY, _CLOSELY = 10, 25  # steps of these, and of those at a blur that is nearly right: most pairs need eight, what is none never ends
 _COARSE = 2.0  # the same of pairs at a blur that is nearly right
 _FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
 _WIDE = 1.5  # times the radius of a blob: what is looked at of pairs
@@ -70,8 +71,9 @@ def optics_of_pairs(
     blobs = [single.rows([i]) for i in np.flatnonzero(rest)[:_ASKED]]
 
     def as_two(sigma_px: float, *, rough: bool = False) -> list[BallFits]:
-        first, stretches = (blobs[:_AT_FIRST], STRETCH[:1]) if rough else (blobs, STRETCH)
-        return [_as_two(film, blob, sigma_px, noise, stretches) for blob in first]
+        if rough:
+            return [_as_two(film, blob, sigma_px, noise, STRETCH[:1], _ROUGHLY) for blob in blobs[:_AT_FIRST]]
+        return [_as_two(film, blob, sigma_px, noise, STRETCH, _CLOSELY) for blob in blobs]
 
     windows = [window_around(film, blob.position_px, _WIDE * blob.radius_px, optics.sigma_px, noise, None) for blob in blobs]
 
@@ -98,13 +100,13 @@ def _surest(seeds: BallFits) -> BallFits:
     return sure.rows(np.argsort(-sure.significance)[:_MOST])
 
 
-def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel, stretches: Sequence[float]) -> BallFits:
+def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel, stretches: Sequence[float], steps: int) -> BallFits:
     axis = long_axis(film, blob, np.sign(blob.depth[0]))
     radius = np.full(2, OF_A_BLOB * blob.radius_px[0])
     fits = []
     for stretch in stretches:
         starts = blob.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
-        fits.append(fit_group(film, starts, radius, sigma_px, KAPPA / sigma_px, noise))
+        fits.append(fit_group(film, starts, radius, sigma_px, KAPPA / sigma_px, noise, steps=steps))
     return min(fits, key=lambda pair: float(pair.chi2_core.mean()))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.equations import polynomial
-from rsa_vision.detect.models.needles import NeedleFit, needle_image
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, needle_image
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.fits import unfit
 from rsa_vision.types import Float, Int
 
 LIKENESS = 0.5  # correlation coefficient from which a place is worth a fit
@@ -24,6 +26,7 @@ _AT = (0.45, 0.65, 0.85)  # of the length from the tip, where a pin may answer t
 _DIRECTIONS = np.linspace(0, 2 * np.pi, 24, endpoint=False).tolist()  # of which each quarter is the first, turned
 _SCALE = 2  # films are compared at half resolution
 _AT_ONCE = 256  # places
+_KEPT = 12  # pins whose images are kept: those that are laid over every film, and a few of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,12 +70,12 @@ def laid_over(film: NDArray[Any], places: Float, pins: Sequence[NeedleFit], opti
     coarse = optics.pooled(_SCALE)
     for k, pin in enumerate(pins):
         half = _SCALE * math.ceil((pin.shape.length_px + 2 * optics.sigma_px) / _SCALE)
-        surface, images = _bare_images(pin, half, coarse)
+        surface, images = _bare_images(pin.shape, half, coarse)
         for first in range(0, len(places), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             values = _around(film, pixel[part], half)
             values -= values @ surface @ surface.T
-            answer = values @ images.T
+            answer = np.sign(pin.depths[0]) * (values @ images.T)
             way = answer.argmax(axis=1)
             like = answer[np.arange(len(way)), way] / np.maximum(np.linalg.norm(values, axis=1), 1e-9)
             better = like > best[part]
@@ -91,13 +94,14 @@ def _lying(length_px: float) -> list[tuple[Float, float]]:
     return [(-at * length_px * way, angle) for way, angle in ways for at in _AT]
 
 
-def _bare_images(pin: NeedleFit, half: int, optics: Optics) -> tuple[Float, Float]:
-    """Return quadratic surfaces (n, 6), and what a pin shows besides them every way round (ways, n), both of length one."""
+@lru_cache(maxsize=_KEPT)
+def _bare_images(shape: NeedleShape, half: int, optics: Optics) -> tuple[Float, Float]:
+    """Return quadratic surfaces (n, 6), and what a bright pin shows besides them every way round (ways, n), both of length one."""
     axis = np.arange(-half, half, _SCALE) + (_SCALE - 1) / 2
     cols, rows = (grid.ravel() for grid in np.meshgrid(axis, axis))
     surface = np.linalg.qr(polynomial(half, cols, rows))[0]
-    ways = _lying(pin.shape.length_px)
-    quarter = [needle_image(cols - x, rows - y, replace(pin, angles=np.array([a])), optics) for (x, y), a in ways[: len(ways) // 4]]
+    ways, bright = _lying(shape.length_px), replace(unfit(np.zeros(2), np.zeros(1), shape), depths=np.ones(1))
+    quarter = [needle_image(cols - x, rows - y, replace(bright, angles=np.array([a])), optics) for (x, y), a in ways[: len(ways) // 4]]
     square = np.reshape(quarter, (-1, len(axis), len(axis)))
     images = np.concatenate([np.rot90(square, turn, axes=(1, 2)) for turn in range(4)]).reshape(len(ways), -1)
     images -= images @ surface @ surface.T

@@ -40,6 +40,7 @@ def fit_group(
     bent: bool = False,
     blurrier: float = 0.0,
     spot: Spot | None = None,
+    steps: int = _STEPS,
     images: Callable[[GroupWindow, Float, Float, Float], GroupImages] | None = None,
 ) -> BallFits:
     """Fit several balls in one window on one background.
@@ -64,6 +65,8 @@ def fit_group(
         Logarithm of the blur of these balls over the film's, in the same window.
     spot : Spot, optional
         That draws them, if it is no Gaussian; they do not lap, then.
+    steps : int
+        At the most.
     images : callable, optional
         ``images(window, surface, local, radius)``: what draws them instead, on a background without an edge.
 
@@ -96,10 +99,10 @@ def fit_group(
         theta = weighted_least_squares(seen.linear, weight, data, 1e-6)
     converged, lost, before = False, np.zeros(k, bool), np.zeros((3, k))
     most = max(_MOST_PX, _MOST_RADII * float(radius.min()))
-    for step in range(_STEPS + 1):
+    for step in range(steps + 1):
         value, linear, jac = seen.value, seen.linear, seen.jacobian(theta)
         residual = data - linear @ theta
-        if step == _STEPS or converged or lost.any():
+        if step == steps or converged or lost.any():
             break
         if step in (4, 10):
             weight = valid / noise.variance_at(linear @ theta + window.neighbours)
