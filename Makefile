@@ -25,8 +25,8 @@ lint-types: $(STAMP)
 lint-docs: $(STAMP)
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
 
-docs: $(STAMP)
-	$(BIN)/sphinx-build -W -b html docs docs/_build/html
+docs: $(STAMP)  ## with the real films, drawn: minutes
+	$(BIN)/sphinx-build -W -D draw_real_films=1 -b html docs docs/_build/html
 
 bench: $(STAMP)  ## hours: marker images against the bound, whole examinations and names against the truth
 	$(BIN)/python benchmarks/detection.py

@@ -1,7 +1,8 @@
 """Real films drawn with what is found on them, while the page is built: no film is copied into the project.
 
 The directive ``real-films`` measures every film of the folder beside the project, draws what it found and, in red, what the labels name and
-it did not find. Where the folder is absent the page says so.
+it did not find. Where the folder is absent the page says so, and where nobody asks for them: they take minutes, and to check the rest of
+the documentation does not need them.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ NEAR_PX = 2.0
 RED = (60, 60, 255)
 LARGEST_PX = 1000
 ABSENT = "The folder of real films (``../shared/data/real``) was not there when this page was built: nothing is drawn."
+LEFT_OUT = "The real films were not asked for when this page was built: ``make docs`` draws them."
 
 
 def labelled(path: Path, rows: list[dict[str, str]], view: str) -> tuple[Path, NDArray[Any]]:
@@ -70,6 +72,8 @@ class RealFilms(SphinxDirective):
         """Return the pictures with their captions."""
         if not REAL.is_dir():
             return self.parse_text_to_nodes(ABSENT)
+        if not self.config.draw_real_films:
+            return self.parse_text_to_nodes(LEFT_OUT)
         folder = Path(self.env.app.outdir) / "_images" / "real_films"
         folder.mkdir(parents=True, exist_ok=True)
         up = "../" * self.env.docname.count("/")
@@ -87,5 +91,6 @@ class RealFilms(SphinxDirective):
 
 def setup(app: Any) -> dict[str, bool]:
     """Register the directive."""
+    app.add_config_value("draw_real_films", False, "env", bool)
     app.add_directive("real-films", RealFilms)
     return {"parallel_read_safe": True}
