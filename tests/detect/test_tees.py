@@ -193,10 +193,10 @@ def test_on_shaded_film_that_is_linear_in_exposure(seed: int) -> None:
 
 
 def test_what_bone_does_slowly_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    quietest, measured = shared._quietest, {}
+    quietest, measured = shared.quietest, {}
     films = [_tees_on_bone(np.random.default_rng(seed)) for seed in range(2)]
     for name, choose in (("fine", quietest), ("all", lambda film, windows, systems, noise: Filter(noise))):
-        monkeypatch.setattr(shared, "_quietest", choose)
+        monkeypatch.setattr(shared, "quietest", choose)
         error, covariance = (np.concatenate(parts) for parts in zip(*(_missed(*film) for film in films), strict=True))
         ratio = np.sqrt(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error).mean() / 2)
         measured[name] = (error**2).mean(), np.median(np.trace(covariance, axis1=1, axis2=2)), ratio

@@ -7,14 +7,13 @@ from one needle these are poor, from all of them they are good. Each needle's ow
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.leftover import LEAST, at_rims, usual_square
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit
@@ -22,7 +21,6 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import Window, window_of
 from rsa_vision.detect.needles.differing import MOST_BLURRIER, MOST_TAPER, Differing, differing, equal
-from rsa_vision.detect.needles.disturbed import louder
 from rsa_vision.detect.needles.equations import (
     BENT,
     BLUR,
@@ -33,10 +31,10 @@ from rsa_vision.detect.needles.equations import (
     by_optics,
     linearise,
 )
-from rsa_vision.detect.needles.fits import between, excess_of, scored
-from rsa_vision.detect.needles.grounds import errors_by_ground
+from rsa_vision.detect.needles.fits import between, excess_of
 from rsa_vision.detect.needles.irregular import ARMS, Regularity, regular, told_by
 from rsa_vision.detect.needles.sets import beside_each, clusters
+from rsa_vision.detect.needles.stated import AtRest, quietest, with_errors
 from rsa_vision.detect.needles.states import (
     LEAST_TAPER,
     Sizes,
@@ -65,8 +63,6 @@ _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much the
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
 _CURVE_ERROR, _CURVE_OF_PINS_ERROR, _TAIL_ERROR = (0.6, 0.1), (1.0, 0.1), 0.07
-# tail below which a film may have been sharpened, by how much less it surely was, and error of a pin's tip by that in units of the blur
-_OF_LIGHT, _OF_LIGHT_ERROR, _BY_SHARPENING = -0.1, 0.1, 0.8
 _ENOUGH_PINS = 3  # that tell what comes after the film curve
 _PIXEL, _MOST_PIXEL = 1 / 12, 0.5  # px^2 of blur by the area of a scanner's pixel, and part of the variance that it may be at first
 _LATE_ERROR, _LOGGED_ERROR, _FIXED = 0.15, 2.5, 1e-3  # of what comes after the film curve, of the logarithm there, of either where it stays
@@ -78,11 +74,7 @@ _BY_CHANCE = 14.0  # chi2 of two degrees of freedom
 _MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1, 0.1, 0.5, 0.1, 0.1])
 _NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.5, 0.1, 0.1])  # changes of those with which the last step gets there
 _SHORTER = 3  # attempts at a step that loses nothing
-# side of squares than which all that is slower is left out, on bone; near enough the best for arms of half widths of 2.5 to 4
-_SQUARE_PX = 17
 _CLOSELY = 0.95  # explained of most, from which it is beyond doubt that they are of a kind: what texture has of them is less
-_GAIN = 0.2  # of the logarithm of the variance of tips, from which they are
-_ASKED = 8  # windows that tell whether it is to be
 
 
 def fit_shared(
@@ -125,7 +117,46 @@ def fit_shared(
     """
     if not needles:
         return [], optics
-    parallel = parallel and len(needles[0].angles) > 1
+    task = _begin(film, needles, optics, noise, balls, parallel=parallel and len(needles[0].angles) > 1, alike=alike)
+    at, systems, precision, through, converged = _come_near(film, task, noise, steps)
+    through = through or quietest(film, task.windows, systems, noise)
+    systems = _filtered(task.windows, systems, through)
+    told = [e.information() for e in compress(systems, task.telling)]
+    normal = precision + sum(matrix for matrix, _ in told)
+    change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at, task.start)
+    step = Step(change, [e.step(change) for e in systems])
+    at = at.after(step, systems, task.parallel)
+    optics = moved_optics(task.start, at.moved)
+    rest = AtRest(task.windows, systems, at.sets, step, task.telling, normal, precision, optics, through, converged)
+    return with_errors(film, rest, noise), optics
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    """What a fit of all needles of a film begins with."""
+
+    windows: list[Window]
+    at: State
+    start: Optics
+    precision: Float  # (c, c), of what is common
+    n_free: int  # of that
+    gain: float  # of the variances, by noise that neighbours share
+    telling: list[bool]  # windows that tell what is common
+    typical: float  # part of the variance that needles explain
+    parallel: bool
+    alike: bool
+
+
+def _begin(
+    film: NDArray[Any],
+    needles: list[NeedleFit],
+    optics: Optics,
+    noise: NoiseModel,
+    balls: BallsBeside | None,
+    *,
+    parallel: bool,
+    alike: bool,
+) -> _Task:
     taper = float(np.median([f.shape.taper for f in needles]))
     sets = clusters([replace(f, shape=replace(f.shape, taper=taper)) for f in needles])
     others = beside_each(sets, optics)
@@ -147,14 +178,35 @@ def fit_shared(
     precision = np.diag(np.array(errors + [_DIRECTION_ERROR] * ((len(needles[0].angles) - 1) * parallel)) ** -2.0)
     # steps weigh pixels as if noise were white, and believe them the more the more neighbours share of it
     gain = float(noise.gain(np.hypot(optics.sigma_px, np.median([f.shape.half_width_px for f in needles]))))
-    held, n_free = precision * gain, len(precision) - len(of_scanner) * (not scanned)
+    n_free = len(precision) - len(of_scanner) * (not scanned)
     sizes = Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     arms = regular(sets) if len(needles[0].angles) == ARMS else None
     at = State(sets, np.zeros(len(precision)), taper, sizes, equal(sets), equal(sets), arms)
     telling = _telling(sets, noise) if alike else [True] * len(sets)
+    typical = float(np.median([f.explained for f in needles]))
+    return _Task(windows, at, optics, precision, n_free, gain, telling, typical, parallel, alike)
+
+
+def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -> tuple[State, list[Equations], Float, Filter | None, bool]:
+    """Go on until the last step gets there; what needles may differ by is asked on the way.
+
+    Returns
+    -------
+    at : State
+    systems : list of Equations
+        There.
+    precision : ndarray of shape (c, c)
+        Of what is common, as far as it has been let free.
+    through : Filter or None
+        Once it has been asked for.
+    converged : bool
+    """
+    windows, at, start, parallel, alike, telling = task.windows, task.at, task.start, task.parallel, task.alike, task.telling
+    precision, sizes, close = task.precision.copy(), at.sizes, _CONVERGED[len(at.sets[0][0].angles)] ** 2
+    held = precision * task.gain
     asked, asked_of_blurs, asked_of_tapers, sizes_at = False, False, not alike, _SIZES_AFTER
-    start, slopes, since, of_each = optics, list[list[Float]](), np.full(OPTICS, np.inf), at
-    last: list[Equations | None] = [None] * len(sets)
+    slopes, since, of_each = list[list[Float]](), np.full(OPTICS, np.inf), at
+    last: list[Equations | None] = [None] * len(windows)
     before: tuple[State, list[Equations], Step] | None = None
     converged, restarted, shorter, least = False, False, 0, np.inf
     through: Filter | None = None
@@ -168,14 +220,14 @@ def fit_shared(
             for w, m, k, expected, e in zip(windows, at.sets, slopes, at.expected, last, strict=True)
         ]
         cost = sum(e.cost for e in systems) + float(at.moved @ held @ at.moved)
-        if before and cost > least + n_free and shorter < _SHORTER and count < steps:
+        if before and cost > least + task.n_free and shorter < _SHORTER and count < steps:
             at, systems, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
             step, shorter, converged = step.shorter(), shorter + 1, False
         else:
             told = [e.information() for e in compress(systems, telling)]
             normal = held + sum(matrix for matrix, _ in told)
             target = np.sum([right for _, right in told], axis=0)
-            if count == steps and not (converged or alike or restarted) and np.median([f.explained for f in needles]) > _CLOSELY:
+            if count == steps and not (converged or alike or restarted) and task.typical > _CLOSELY:
                 # some have gone astray, far from a straight line: tees of a film are of one size, and from there they all may get there
                 at, least, before, restarted = replace(at, sets=of_usual_size(at.sets)), np.inf, None, True
                 steps += _MORE_STEPS
@@ -189,25 +241,21 @@ def fit_shared(
             far = float(change @ normal @ change) / len(change)
             step = Step(change, [e.step(change) for e in systems])
             surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, step.own, strict=True)])
-            converged = count > 0 and max(float(surprise.mean()), far if alike else 0.0) < _CONVERGED[len(needles[0].angles)] ** 2
+            converged = count > 0 and max(float(surprise.mean()), far if alike else 0.0) < close
             converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
             ask_of_blurs = (converged or count >= _BLURS_AFTER) and not asked_of_blurs
             ask_of_tapers = (converged or count >= _TAPERS_AFTER) and count >= sizes_at and not asked_of_tapers
             ask = (converged or count >= _ASKED_AFTER) and not asked  # near enough to tell how far their arms differ
             if ask_of_blurs or ask_of_tapers or ask:  # what needles differ by, and not what noise and bone under them make of that
-                through = through or _quietest(film, windows, systems, noise)
+                through = through or quietest(film, windows, systems, noise)
                 quiet = _filtered(windows, systems, through)
             if ask_of_blurs:
                 asked_of_blurs = True
                 if differ := _blurs(quiet):
                     moved = at.moved.copy()  # a curve that made up for them leads astray
                     moved[BENT] = [-was for was in (*start.curve, start.tail, 0.0, start.logged, *start.uneven)]
-                    at, converged, least, before = (
-                        replace(at, sets=differ[0], blurs=differ[1], moved=moved, sizes=sizes),
-                        False,
-                        np.inf,
-                        None,
-                    )
+                    at = replace(at, sets=differ[0], blurs=differ[1], moved=moved, sizes=sizes)
+                    converged, least, before = False, np.inf, None
                     steps, sizes_at = steps + _MORE_STEPS, count + 1 + _SIZES_AFTER
                     continue
             if ask_of_tapers:
@@ -219,9 +267,9 @@ def fit_shared(
             if ask:
                 asked = True
                 odd = _odd(quiet, at) if parallel else None
-                if uneven := _is_uneven(precision, normal - held, target, at.moved, gain):
+                if uneven := _is_uneven(precision, normal - held, target, at.moved, task.gain):
                     precision[UNEVEN, UNEVEN] = _OF_UNEVEN
-                    held = precision * gain
+                    held = precision * task.gain
                 if odd or uneven:
                     at, converged, least, before = replace(at, regularity=odd or at.regularity), False, np.inf, None
                     continue
@@ -230,32 +278,9 @@ def fit_shared(
         before, last = (at, systems, step), [*systems]
         at = at.after(step, systems, parallel)
         if alike and count + 1 == sizes_at:
-            through = through or _quietest(film, windows, systems, noise)
+            through = through or quietest(film, windows, systems, noise)
             at, converged, least = replace(at, sizes=sizes_of(_filtered(windows, systems, through))), False, np.inf
-    through = through or _quietest(film, windows, systems, noise)
-    systems = _filtered(windows, systems, through)
-    told = [e.information() for e in compress(systems, telling)]
-    normal = precision + sum(matrix for matrix, _ in told)
-    change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at, start)
-    step = Step(change, [e.step(change) for e in systems])
-    at = at.after(step, systems, parallel)
-    optics = moved_optics(start, at.moved)
-    left = np.array([e.noise_under(own, change) for e, own in zip(systems, step.own, strict=True)])
-    left = left[np.isfinite(left)]
-    # less noise under needles than beside them is that of the film; more may as well be an error of the model, which is each one's own
-    under = at_rims(min(usual_square(left), 1.0)) if len(left) >= LEAST else 1.0
-    by_noise = [_by_noise(window, e, through) for window, e in zip(windows, systems, strict=True)]
-    of_common = _common_errors(list(compress(systems, telling)), list(compress(by_noise, telling)), normal, precision, under)
-    out = []
-    for window, e, members, scatter in zip(windows, systems, at.sets, by_noise, strict=True):
-        out += _finished(window, e, members, under * scatter, of_common, optics, noise, converged)
-    tips = [scatter[: len(e.tips), : len(e.tips)] for scatter, e in zip(by_noise, systems, strict=True)]
-    by_ground = errors_by_ground(film, windows, systems, tips, out, through)
-    over = [louder(w, e, own, change, optics.sigma_px) for w, e, own in zip(windows, systems, step.own, strict=True)]
-    more = _more(out, np.concatenate(by_ground), tips, over, noise)
-    return [
-        replace(f, covariance_px2=f.covariance_px2 + extra + _by_sharpening(f, optics)) for f, extra in zip(out, more, strict=True)
-    ], optics
+    return at, systems, precision, through, converged
 
 
 def _telling(sets: list[list[NeedleFit]], noise: NoiseModel) -> list[bool]:
@@ -322,80 +347,3 @@ def _is_uneven(precision: Float, told: Float, target: Float, moved: Float, gain:
     covariance = np.linalg.inv(told + gain * free)
     uneven = moved[UNEVEN] + (covariance @ (target - gain * free @ moved))[UNEVEN]
     return bool(uneven @ np.linalg.solve(covariance[UNEVEN, UNEVEN], uneven) > gain * _BY_CHANCE)
-
-
-def _quietest(film: NDArray[Any], windows: list[Window], systems: list[Equations], noise: NoiseModel) -> Filter:
-    """Return the filter with which noise and the film beside some needles move their tips least."""
-    needles = [f for e in systems for f in e.members]
-    asked = slice(None, None, 1 + len(systems) // _ASKED)
-    variances = {}
-    for through in (Filter(noise), Filter(noise, _SQUARE_PX)):
-        some = [e.filtered(w, through) for e, w in zip(systems[asked], windows[asked], strict=True)]
-        scatter = [_by_noise(w, e, through)[: len(e.tips), : len(e.tips)] for e, w in zip(some, windows[asked], strict=True)]
-        by_ground = np.concatenate(errors_by_ground(film, windows[asked], some, scatter, needles, through))
-        variances[through] = np.concatenate([s.diagonal() for s in scatter]) + np.einsum("maa->ma", by_ground).ravel()
-    plain, fine = (float(np.log(v).mean()) for v in variances.values())
-    return list(variances)[fine < plain - _GAIN]
-
-
-def _by_noise(window: Window, e: Equations, through: Filter) -> Float:
-    """Covariance that noise which neighbouring pixels share makes of the tips, and of what the common parameters are estimated from."""
-    influence = np.concatenate([e.inverse[e.tips] @ e.own, e.common - e.own_by_common.T @ e.own])
-    return window.covariance(window.filtered(influence, through), through.noise)
-
-
-def _common_errors(systems: list[Equations], by_noise: list[Float], normal: Float, precision: Float, under: float) -> Float:
-    """Covariance of the common parameters."""
-    spread = precision.copy()
-    for e, scatter in zip(systems, by_noise, strict=True):
-        rest = slice(len(e.tips), None)
-        spread += (under * scatter[rest, rest] + e.own_by_common.T @ (e.prior[:, None] ** 2 * e.own_by_common)) / e.excess
-    inverse = np.linalg.inv(normal)
-    covariance: Float = inverse @ spread @ inverse
-    return covariance
-
-
-def _by_sharpening(needle: NeedleFit, optics: Optics) -> Float:
-    """Covariance (2, 2) of the tip of a pin on a film that was sharpened: no light has a negative tail, and what stands in for it bends."""
-    if len(needle.angles) > 1:  # the others hold it
-        return np.zeros((2, 2))
-    amount = between((_OF_LIGHT - optics.tail) / _OF_LIGHT_ERROR, 0.0, 1.0)
-    along = np.array([np.cos(needle.angles[0]), -np.sin(needle.angles[0])])
-    return (amount * _BY_SHARPENING * optics.sigma_px) ** 2 * np.outer(along, along)
-
-
-def _finished(
-    window: Window,
-    e: Equations,
-    members: list[NeedleFit],
-    by_noise: Float,
-    errors: Float,
-    optics: Optics,
-    noise: NoiseModel,
-    converged: bool,
-) -> list[NeedleFit]:
-    by_common, tips = e.own_by_common[e.tips], slice(len(e.tips))
-    covariance = by_noise[tips, tips] + by_common @ errors @ by_common.T
-    of_prior = e.inverse[e.tips] * e.prior  # what is held near to the expected is not exactly there
-    covariance = covariance + of_prior @ of_prior.T
-    variance = float(noise.variance_at(np.array([e.background]))[0])
-    out = []
-    for i, (fit, image) in enumerate(zip(members, e.images, strict=True)):
-        at = slice(2 * i, 2 * i + 2)
-        fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
-        out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance, window.hidden, optics))
-    return out
-
-
-def _more(needles: list[NeedleFit], by_ground: Float, by_noise: list[Float], over: list[float], noise: NoiseModel) -> Float:
-    """Covariances (n, 2, 2) by what else lies over needles: what the film beside them promises, or what their fits leave if that is more.
-
-    ``by_noise``: covariances of the tips of each window; ``over``: what to multiply them by.
-    """
-    out = by_ground.copy()
-    each = [(matrix[i : i + 2, i : i + 2], times) for matrix, times in zip(by_noise, over, strict=True) for i in range(0, len(matrix), 2)]
-    for k, (own, times) in enumerate(each):
-        left = max(times / excess_of(needles[k], noise) - 1.0, 0.0) * own  # by the excess the table widens all of it
-        if np.trace(left) > np.trace(out[k]):
-            out[k] = left
-    return out
