@@ -224,7 +224,7 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
         of_tees, needles = optics_of_tees(film, tees, under)
         if len(clear) or needles > balls:
             optics = of_tees
-    if not len(clear) and needles <= balls < _ONE_BALL:
+    if needles <= balls < _ONE_BALL and (not len(clear) or needles == 0):  # where no tee is, clear junctions are something else
         more = [p for p in look_for_pins(film, candidates.strokes, under) if np.sign(p.depth) == sign]
         of_pins, evidence = optics_of_pins(film, of_sign + more, under)
         if balls < _LEAST_EVIDENCE or evidence > _OF_PINS:

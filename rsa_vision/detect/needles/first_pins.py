@@ -11,15 +11,19 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import explains, fit_needles, unfit
 from rsa_vision.detect.needles.laid_over import LIKENESS, laid_over
-from rsa_vision.detect.needles.optics import GUESS
+from rsa_vision.detect.needles.optics import BLURS_PX, GUESS
 from rsa_vision.detect.needles.pointed import STANDS_OUT_ROUGHLY, same_body, turned, unexplained
 from rsa_vision.detect.needles.sets import NEAREST_PX, TAPERS, on_arms
 from rsa_vision.types import Float
 
 MOST_STROKES = 120  # strongest of a film, most of them seen by two filters
 _ROUGH = 0.85  # explained by a first look, with guessed optics
+# from which a first look with a sharper guess is worth it, which has to explain so much; those in a row that are tried in vain
+_NEARLY, _SHARPLY, _MOST_SHARPER = 0.7, 0.95, 4
+_SHARP = replace(GUESS, sigma_px=BLURS_PX[0])
 _MOST_IN_VAIN = 20  # strokes in a row that are no pins
 _AGAIN = 0.3  # part of a stroke's length within which another is the same
 _CLOSE_FIT = 0.03  # misfit and what is not explained, of a pin whose taper is right
@@ -44,26 +48,36 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
     """
     found: list[NeedleFit] = []
     tried = np.zeros((0, 2))
-    in_vain = 0
-    for col, row, angle, length, width, _ in strokes:
-        if (np.hypot(*(tried - [col, row]).T) < _AGAIN * length).any():
+    in_vain, sharper = 0, 0
+    for stroke in strokes:
+        if (np.hypot(*(tried - stroke[:2]).T) < _AGAIN * stroke[3]).any():
             continue  # the same stroke, seen by another filter
-        tried = np.append(tried, [[col, row]], axis=0)
+        tried = np.append(tried, stroke[None, :2], axis=0)
         in_vain += 1
-        fits: list[NeedleFit] = []
-        for turn in (angle, angle + np.pi):
-            if fits and unexplained(fits[0]) < _CLOSE_FIT:
-                break
-            start = NeedleShape(max(0.9, 0.5 * width), 1.45 * length, TAPERS[0])  # the answer fades before the tip
-            tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
-            fits.append(fit_needles(film, tip, np.array([turn]), start, GUESS, noise, quick=True))
-        best = max(fits, key=lambda f: f.explained)
+        best = _either_way(film, stroke, GUESS, noise)
+        if not explains(best, _ROUGH, STANDS_OUT_ROUGHLY) and best.explained > _NEARLY and sharper < _MOST_SHARPER:
+            sharp = _either_way(film, stroke, _SHARP, noise)  # as sharpened films show thin pins
+            sharper = 0 if explains(sharp, _SHARPLY) else sharper + 1
+            best = sharp if sharper == 0 else best
         if explains(best, _ROUGH, STANDS_OUT_ROUGHLY):
             found.append(best)
             in_vain = 0
         if in_vain == _MOST_IN_VAIN:
             break
     return distinct(found)
+
+
+def _either_way(film: NDArray[Any], stroke: Float, optics: Optics, noise: NoiseModel) -> NeedleFit:
+    """Fit a pin to a stroke either way round; return what explains more."""
+    col, row, angle, length, width, _ = stroke
+    fits: list[NeedleFit] = []
+    for turn in (angle, angle + np.pi):
+        if fits and unexplained(fits[0]) < _CLOSE_FIT:
+            break
+        start = NeedleShape(max(0.9, 0.5 * width), 1.45 * length, TAPERS[0])  # the answer fades before the tip
+        tip = np.array([col, row]) - 0.6 * start.length_px * np.array([np.cos(turn), -np.sin(turn)])
+        fits.append(fit_needles(film, tip, np.array([turn]), start, optics, noise, quick=True))
+    return max(fits, key=lambda f: f.explained)
 
 
 def likest_pins(film: NDArray[Any], places: Float, sign: int, noise: NoiseModel) -> list[NeedleFit]:
