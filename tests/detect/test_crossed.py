@@ -15,7 +15,7 @@ from .films import film_of_balls, grid_of_balls, stored
 
 SIDE, SIGMA_PX, RADIUS_PX = 700, 1.4, 4.0
 BACKGROUND, DEPTH, CNR = 30000.0, 0.45, 30.0
-FILMS = 1
+FILMS = 2
 FAR, MOST_FAR = 4.0, 0.03
 
 

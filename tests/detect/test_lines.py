@@ -13,7 +13,7 @@ from .films import film_of_balls, grid_of_balls, stored, strip
 SIDE, SIGMA_PX, RADIUS_PX = 760, 1.4, 4.0
 DEPTH, CNR, NOISE_BLUR_PX = 0.45, 15.0, 0.8
 BACKGROUND = 30000.0
-FILMS = 1
+FILMS = 2
 MOST_FALSE, LEAST_FOUND = 2, 0.95  # of a film with 32 wires; there were 9 to 13
 FAR = 4.5
 

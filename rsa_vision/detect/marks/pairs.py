@@ -15,7 +15,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.blobs import CLEAR, LEAST_GAIN, NEARLY, OF_A_BLOB, STRETCH, long_axis
 from rsa_vision.detect.neighbours.group_images import GroupWindow, images_in, window_around
-from rsa_vision.detect.neighbours.groups import fit_group
+from rsa_vision.detect.neighbours.groups import STEPS, fit_group
 from rsa_vision.detect.neighbours.oblong import are_oblong
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
@@ -24,7 +24,7 @@ _MOST = 100  # seeds among which single balls are looked for
 _STRONGEST = 24  # candidates that are asked where there is no seed
 _FEW = 8  # of the seeds, asked first
 _ASKED, _AT_FIRST = 4, 2  # surest blobs; those asked while the blur is anybody's
-_ROUGHLY, _CLOSELY = 10, 25  # steps of these, and of those at a blur that is nearly right: most pairs need eight, what is none never ends
+_ROUGH_STEPS = 10  # of these: most pairs need eight, what is none does not come to rest
 _COARSE = 2.0  # the same of pairs at a blur that is nearly right
 _FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
 _WIDE = 1.5  # times the radius of a blob: what is looked at of pairs
@@ -72,8 +72,8 @@ def optics_of_pairs(
 
     def as_two(sigma_px: float, *, rough: bool = False) -> list[BallFits]:
         if rough:
-            return [_as_two(film, blob, sigma_px, noise, STRETCH[:1], _ROUGHLY) for blob in blobs[:_AT_FIRST]]
-        return [_as_two(film, blob, sigma_px, noise, STRETCH, _CLOSELY) for blob in blobs]
+            return [_as_two(film, blob, sigma_px, noise, STRETCH[:1], _ROUGH_STEPS) for blob in blobs[:_AT_FIRST]]
+        return [_as_two(film, blob, sigma_px, noise, STRETCH) for blob in blobs]
 
     windows = [window_around(film, blob.position_px, _WIDE * blob.radius_px, optics.sigma_px, noise, None) for blob in blobs]
 
@@ -100,7 +100,9 @@ def _surest(seeds: BallFits) -> BallFits:
     return sure.rows(np.argsort(-sure.significance)[:_MOST])
 
 
-def _as_two(film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel, stretches: Sequence[float], steps: int) -> BallFits:
+def _as_two(
+    film: NDArray[Any], blob: BallFits, sigma_px: float, noise: NoiseModel, stretches: Sequence[float], steps: int = STEPS
+) -> BallFits:
     axis = long_axis(film, blob, np.sign(blob.depth[0]))
     radius = np.full(2, OF_A_BLOB * blob.radius_px[0])
     fits = []

@@ -17,7 +17,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
 from rsa_vision.detect.needles.first_pins import best_tapered, distinct, likest_pins
-from rsa_vision.detect.needles.fits import excess_of, fit_needles, significant_misfit
+from rsa_vision.detect.needles.fits import between, excess_of, fit_needles, significant_misfit
 from rsa_vision.detect.needles.of_a_kind import are_alike, are_of_a_kind, odd_lengths, others_like, without_company
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
 from rsa_vision.detect.needles.pointed import (
@@ -42,6 +42,8 @@ _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth o
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length, by the third power of the curve, by it and the logarithm of the depth, by the others
 _OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.015, 0.05, 0.03, 2.0
+# tail below which a film may have been sharpened, by how much less it surely was, and error along a pin by that in units of the blur
+_OF_LIGHT, _OF_LIGHT_ERROR, _BY_SHARPENING = -0.1, 0.1, 0.8
 _NO_OTHER = 0.15  # from a usual taper: the last fit gets there itself
 _SAMPLE = 6
 _MOST_ASKED = 18  # for the optics that they have in common
@@ -270,12 +272,15 @@ def _proportion(pins: list[NeedleFit]) -> float:
 def _less_sure_along(fit: NeedleFit, typical: float, odd_px: float, optics: Optics, noise: NoiseModel) -> NeedleFit:
     """Add an error along the pin: of film curve and blur as far as their models go, of what else lies there, of a point that is no cone.
 
+    No light has a negative tail: software has sharpened such a film, and what stands in for that bends the curve.
+
     ``typical`` is the depth of the film's pins; ``odd_px`` as of :func:`odd_lengths`. Across the pin nothing of this could move it.
     """
     by_rest = _OF_MISFIT * significant_misfit(fit, noise) / np.sqrt(excess_of(fit, noise))  # by that the table widens all of it
     # where film responds more or less than usual, it is bent more or less as well
     unlike = abs(math.log(fit.depth / typical))
     by_model = np.array([_OF_CURVE * optics.curve[0] ** 3, _OF_UNLIKE * optics.curve[0] * unlike, _OF_TAIL * optics.tail, by_rest])
-    parts = [odd_px, _POINT * fit.shape.half_width_px, *(fit.shape.length_px * by_model)]
+    sharpened = between((_OF_LIGHT - optics.tail) / _OF_LIGHT_ERROR, 0.0, 1.0)
+    parts = [odd_px, _POINT * fit.shape.half_width_px, _BY_SHARPENING * sharpened * optics.sigma_px, *(fit.shape.length_px * by_model)]
     error_px = float(np.linalg.norm(parts))
     return replace(fit, covariance_px2=fit.covariance_px2 + error_px**2 * np.outer(fit.way, fit.way))

@@ -1,4 +1,4 @@
-"""Where the tips of needles that are fitted together are, and how far they may be off: noise, what is common, bone, the film's software."""
+"""Where the tips of needles that are fitted together are, and how far they may be off: noise, what is common, bone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window
 from rsa_vision.detect.needles.disturbed import louder
 from rsa_vision.detect.needles.equations import Equations
-from rsa_vision.detect.needles.fits import between, excess_of, scored
+from rsa_vision.detect.needles.fits import excess_of, scored
 from rsa_vision.detect.needles.grounds import errors_by_ground
 from rsa_vision.detect.needles.states import Step
 from rsa_vision.types import Float
@@ -26,8 +26,6 @@ from rsa_vision.types import Float
 _SQUARE_PX = 17
 _GAIN = 0.2  # of the logarithm of the variance of tips, from which they are
 _ASKED = 8  # windows that tell whether it is to be
-# tail below which a film may have been sharpened, by how much less it surely was, and error of a pin's tip by that in units of the blur
-_OF_LIGHT, _OF_LIGHT_ERROR, _BY_SHARPENING = -0.1, 0.1, 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +91,7 @@ def with_errors(film: NDArray[Any], fit: AtRest, noise: NoiseModel) -> list[Need
     by_ground = errors_by_ground(film, windows, systems, tips, out, fit.through)
     over = [louder(w, e, own, step.change, optics.sigma_px) for w, e, own in zip(windows, systems, step.own, strict=True)]
     more = _more(out, np.concatenate(by_ground), tips, over, noise)
-    return [replace(f, covariance_px2=f.covariance_px2 + extra + _by_sharpening(f, optics)) for f, extra in zip(out, more, strict=True)]
+    return [replace(f, covariance_px2=f.covariance_px2 + extra) for f, extra in zip(out, more, strict=True)]
 
 
 def quietest(film: NDArray[Any], windows: list[Window], systems: list[Equations], noise: NoiseModel) -> Filter:
@@ -138,15 +136,6 @@ def _common_errors(fit: AtRest, by_noise: list[Float], under: float) -> Float:
     inverse = np.linalg.inv(fit.normal)
     covariance: Float = inverse @ spread @ inverse
     return covariance
-
-
-def _by_sharpening(needle: NeedleFit, optics: Optics) -> Float:
-    """Covariance (2, 2) of the tip of a pin on a film that was sharpened: no light has a negative tail, and what stands in for it bends."""
-    if len(needle.angles) > 1:  # the others hold it
-        return np.zeros((2, 2))
-    amount = between((_OF_LIGHT - optics.tail) / _OF_LIGHT_ERROR, 0.0, 1.0)
-    along = np.array([np.cos(needle.angles[0]), -np.sin(needle.angles[0])])
-    return (amount * _BY_SHARPENING * optics.sigma_px) ** 2 * np.outer(along, along)
 
 
 def _finished(

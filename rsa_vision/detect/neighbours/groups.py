@@ -18,7 +18,7 @@ from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.group_images import GroupImages, GroupWindow, images_in, window_around
 from rsa_vision.types import Float
 
-_STEPS = 25
+STEPS = 25
 _CONVERGED_PX = 1e-3
 _MOST_PX, _LAST_PX = 0.5, 1.0  # of a step; of the last one, which is not held near: from farther off no straight line leads there
 _MOST_RADII = 0.12  # of a step, of large balls
@@ -40,7 +40,7 @@ def fit_group(
     bent: bool = False,
     blurrier: float = 0.0,
     spot: Spot | None = None,
-    steps: int = _STEPS,
+    steps: int = STEPS,
     images: Callable[[GroupWindow, Float, Float, Float], GroupImages] | None = None,
 ) -> BallFits:
     """Fit several balls in one window on one background.
