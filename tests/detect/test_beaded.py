@@ -62,7 +62,9 @@ def test_pins_with_balls(nearest: float) -> None:
 
 def ball_at(col: float, row: float, depth: float = -1000.0) -> BallFits:
     one, none = np.ones(1), np.zeros(1)
-    return BallFits(np.array([[col, row]]), 4 * one, depth * one, np.zeros((1, 4, 4)), *[none] * 6, one, *[none] * 3, one > 0)
+    return BallFits(
+        np.array([[col, row]]), 4 * one, depth * one, np.zeros((1, 4, 4)), *[none] * 6, one, *[none] * 3, one > 0, np.zeros(1, np.int64)
+    )
 
 
 def test_what_lies_over_a_pin() -> None:

@@ -44,7 +44,7 @@ def test_faint_marks_are_lost_among_texture_only() -> None:
     balls = np.stack([np.full(count, 500.0), 100.0 * np.arange(count)], axis=1)
     own, explained = np.array([20.0, 6.5, 6.5, 5.0, 5.0]), np.array([0.9, 0.9, 0.97, 0.9, 0.99])
     none = np.zeros((count, 4, 4))
-    fits = BallFits(balls, np.full(count, 4.0), own, none, *[own] * 3, explained, *[own] * 6, own > 0)
+    fits = BallFits(balls, np.full(count, 4.0), own, none, *[own] * 3, explained, *[own] * 6, own > 0, np.zeros(count, np.int64))
     for texture, lost in (
         (rng.uniform(5.6, 9.0, 400), [1, 3]),
         (rng.uniform(4.0, 5.4, 400), []),

@@ -14,7 +14,7 @@ def balls(cols: list[float], significance: list[float]) -> BallFits:
     n = len(cols)
     ones = np.ones(n)
     position = np.column_stack([cols, np.zeros(n)])
-    fits = [position, 4 * ones, -1000 * ones, np.tile(0.01 * np.eye(4), (n, 1, 1)), *[ones] * 10, ones > 0]
+    fits = [position, 4 * ones, -1000 * ones, np.tile(0.01 * np.eye(4), (n, 1, 1)), *[ones] * 10, ones > 0, np.zeros(n, np.int64)]
     names = [name for name in BallFits.__slots__ if not name.startswith("_")]
     known = dict(zip(names, fits, strict=True))
     return BallFits(**{**known, "significance": np.array(significance)})

@@ -37,7 +37,7 @@ def over_clutter(fits: BallFits) -> Float:
 
 def look_clear(fits: BallFits, noise: NoiseModel) -> Bool:
     """Say which first fits show what balls of the film are like; hardly anything but balls is among them."""
-    return np.asarray((over_clutter(fits) > SURE) & (misfit(fits, noise) < MISFIT) & (fits.explained > CLOSE))
+    return _rather_on_film((over_clutter(fits) > SURE) & (misfit(fits, noise) < MISFIT) & (fits.explained > CLOSE), fits)
 
 
 def like_clear(fits: BallFits, known: BallFits, limit: float, noise: NoiseModel) -> Bool:
@@ -164,8 +164,14 @@ def _are_sure(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
 
 def _pattern(fits: BallFits, clear: Bool, sigma_px: float) -> tuple[Bool, Float]:
     """Say which stand as a pattern for others, and of which radii."""
-    pattern = _not_faint(clear & (fits.explained > CLOSE), height_of(fits, sigma_px))
+    pattern = _rather_on_film(_not_faint(clear & (fits.explained > CLOSE), height_of(fits, sigma_px)), fits)
     return pattern, _sizes(fits, pattern, sigma_px)
+
+
+def _rather_on_film(pattern: Bool, fits: BallFits) -> Bool:
+    """Leave out those in saturated film, where enough others tell: their depths are no more than the fits make of their middles."""
+    seen = pattern & (fits.hidden == 0)
+    return seen if np.count_nonzero(seen) >= LEAST_KNOWN else pattern
 
 
 def faint_beside(fits: BallFits, needles: list[NeedleFit], sigma_px: float, noise: NoiseModel) -> Bool:

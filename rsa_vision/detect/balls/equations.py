@@ -123,9 +123,11 @@ class Equations:
         return out
 
 
-def weighted(pixels: Pixels, data: NDArray[Any], weight: NDArray[Any]) -> Equations:
-    """Return the equations of windows with these weights (n, p)."""
+def weighted(pixels: Pixels, data: NDArray[Any], weight: NDArray[Any], held: Float) -> Equations:
+    """Return the equations of windows with these weights (n, p), slopes and bends of the backgrounds held near none so strongly (n, 5)."""
     k = pixels.surface.shape[1]
     exact = weight.astype(np.float64)
     normal = (exact @ pixels.squares).reshape(len(data), k, k)
+    bends = np.arange(1, k)
+    normal[:, bends, bends] += held
     return Equations(pixels.surface, data, weight, exact, invert(normal), (weight * data) @ pixels.surface)

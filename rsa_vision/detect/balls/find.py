@@ -32,6 +32,7 @@ EXPLAINED = 0.9
 PROMISING = 0.85  # of the significance a mark must have: better fits are 3 % more significant mostly, 10 % at the most
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 _CAP, _CAP_MISFIT, _CAP_SURE = 0.4, 0.03, 20.0  # of a ball seen, that is enough if it leaves so little and stands out so far
+_CAP_PIXELS = 12  # of such a one, if nothing beside it is seen
 _SMALLEST_PX = 2.5  # radius of the smallest marks looked for: so many independent places has a film
 STANDS_OUT = 7.0  # significance over noise and structure around, from which noise may hide the ball's form
 
@@ -116,12 +117,21 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     # per cent; of a ball that is cut off, its rim
     whole = fits.valid_fraction > np.where((left < _CAP_MISFIT * slack) & (fits.significance > _CAP_SURE), _CAP, 0.6)
     seen = ((fits.valid_fraction > 0.1) & (fits.window_fraction > 0.5)) | (whole & (fits.window_fraction > 0.05))
+    seen |= (left < _CAP_MISFIT * slack) & (fits.significance > _CAP_SURE) & (fits.n_core >= _CAP_PIXELS) & ~short_of_end(fits, noise)
+    seen &= fits.hidden * fits.depth <= 0  # beyond the upper end only dark marks can be, beyond the lower one bright ones
     usable = seen & np.isfinite(fits.position_px).all(1)
     # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
     least = 1 - (1 - EXPLAINED) * slack
     stands_out = fits.significance / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
     explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
     return usable & (left < MISFIT * slack) & explained & (fits.significance > 5.0)
+
+
+def short_of_end(fits: BallFits, noise: NoiseModel) -> Bool:
+    """Say which have a background that does not come to the end of the range that is said to hide it, shape (n,)."""
+    slack = MISFIT * np.abs(fits.depth)
+    upper, lower = fits.background < noise.ceiling - slack, fits.background > noise.floor + slack
+    return np.asarray(np.where(fits.hidden > 0, upper, (fits.hidden < 0) & lower))
 
 
 def in_correlated_noise(fits: BallFits, sigma_px: float, noise: NoiseModel) -> Float:
@@ -236,4 +246,4 @@ def significance_limit(film_size: int, false_detections: float) -> float:
 def no_fits() -> BallFits:
     """Return an empty table."""
     none = np.zeros(0)
-    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), *(none,) * 10, np.zeros(0, bool))
+    return BallFits(np.zeros((0, 2)), none, none, np.zeros((0, 4, 4)), *(none,) * 10, np.zeros(0, bool), np.zeros(0, np.int64))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rsa_vision.detect.balls.cut_off import depths_cut_off, grounds_cut_off
 from rsa_vision.detect.balls.equations import invert, pixels_of, polynomial, weighted
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import Patches
@@ -21,8 +22,6 @@ _FADED = 4.0  # blur widths beyond the rim where nothing is left of a ball's ima
 _SPARSE_PX = 14  # pixels either way that a first look needs of a window
 _CONVERGED_PX = 2e-4
 _NEAR_PX = 5e-3  # enough for a first look
-_CUT_OFF = 0.5  # of the pixels inside a ball, from which its depth is told by what can be
-_DEEPER, _DEEPER_SD = 1.4, 0.5  # depth of such a ball, and its error, of what the range has room for
 _MAX_STEP_PX = 0.7
 
 
@@ -61,6 +60,9 @@ class BallFits:
     n_core : ndarray of shape (n,)
         Pixels under the ball that were looked at.
     converged : ndarray of bool, shape (n,)
+    hidden : ndarray of int, shape (n,)
+        Which end of the range hides the background, as of :func:`rsa_vision.detect.balls.cut_off.grounds_cut_off`: the ball's middle is all
+        that is seen.
     """
 
     position_px: Float
@@ -78,6 +80,7 @@ class BallFits:
     significance: Float
     n_core: Float
     converged: Bool
+    hidden: Int
 
     def rows(self, index: Any) -> BallFits:
         """Return the fits that ``index`` selects."""
@@ -175,7 +178,9 @@ def fit_balls(
     depth = np.zeros(n)
     converged = np.zeros(n, bool)
 
-    known, expected = _depths_cut_off(values.take(pixels.place, axis=1), valid > 0, pixels.distance < radius[:, None], noise)
+    looked_at, beyond_rim = (values.take(pixels.place, axis=1), valid > 0), own & (pixels.distance > (radius + sigma_px)[:, None])
+    known, expected = depths_cut_off(*looked_at, pixels.distance < radius[:, None], noise)
+    even, hidden = grounds_cut_off(*looked_at, beyond_rim, noise)
 
     def images(of: Any) -> Float:
         far = np.hypot(*(local[of] - half).T) + radius[of] + _FADED * sigma_px
@@ -184,14 +189,14 @@ def fit_balls(
         value, *by = slopes(table, dx, dy, radius[of], sigma_px)
         return np.stack([*by, value], axis=1)
 
-    equations = weighted(pixels, data, valid / noise.variance_at(level).astype(np.float32))
+    equations = weighted(pixels, data, valid / noise.variance_at(level).astype(np.float32), even)
     busy: Any = slice(None)
     reweighted = _REWEIGHTED[:1] if quick else _REWEIGHTED
     for step in range(_QUICK_STEPS if quick else _STEPS):
         seen = images(busy)
         if step in reweighted:  # the variance follows the expected value once the model is near
             model = equations.model(seen, depth) + beside
-            equations = weighted(pixels, data, valid / noise.variance_at(model).astype(np.float32))
+            equations = weighted(pixels, data, valid / noise.variance_at(model).astype(np.float32), even)
         normal, right, _ = equations.normal(seen, busy, damping=1e-6)
         normal[:, 3, 3] += known[busy]
         right[:, 3] += (known * expected)[busy]
@@ -260,23 +265,8 @@ def fit_balls(
         significance=np.abs(depth) / np.sqrt(np.maximum(variance / np.maximum(alone, 1.0), 1e-30)),
         n_core=core_n,
         converged=converged,
+        hidden=hidden,
     )
-
-
-def _depths_cut_off(values: Float, valid: Bool, inside: Bool, noise: NoiseModel) -> tuple[Float, Float]:
-    """One over the variance of the depths of balls whose middle is cut off by an end of the range, and what they may be; (n,) each.
-
-    Rims tell how steep an image is; how deep, and with it the radius, they hardly do.
-    """
-    known, expected = np.zeros((2, len(values)))
-    if np.isinf(noise.floor) and np.isinf(noise.ceiling):
-        return known, expected
-    for end, beyond in ((noise.floor, values <= noise.floor), (noise.ceiling, values >= noise.ceiling)):
-        cut = (beyond & inside).sum(axis=1) > _CUT_OFF * inside.sum(axis=1)
-        for k in np.flatnonzero(cut & valid.any(axis=1)):
-            room = end - float(np.median(values[k, valid[k]]))
-            expected[k], known[k] = _DEEPER * room, (_DEEPER_SD * room) ** -2.0
-    return known, expected
 
 
 def uneven(residual: Float, weight: Float, local: Float, size: int, core: Bool) -> Float:

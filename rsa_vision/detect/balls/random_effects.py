@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rsa_vision.detect.balls.cut_off import grounds_cut_off
 from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits
 from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
@@ -25,6 +26,7 @@ _AFRESH, _FAR_PX = (0, 1, 3), 0.1  # those with new derivatives, besides those a
 _MAX_STEP_PX = 0.7
 _FIXED = 1e6  # inverse variance of a radius that is not fitted
 _OUTLIER = 3.0  # standard deviations from which a ball has a size of its own
+_BENDS = slice(5, 10)  # of what is fitted of a ball: slopes and bends of its background
 _PER_BALL = 10  # centre, radius, depth, and the six coefficients of a quadratic surface
 _SHARES = np.exp(np.linspace(-3.0, 6.0, 28))  # of structure in a window, of that at the places around it
 
@@ -108,6 +110,8 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
     target, held = hold(fits, common)
     precision = np.zeros((len(depth), 4 + len(surface)))
     precision[:, 2], precision[:, _PER_BALL:] = held, _precision(known, structure, fits, noise)
+    beside = np.hypot(cols - local[:, :1], rows - local[:, 1:]) > (radius + common.rim_px)[:, None]
+    precision[:, _BENDS] = grounds_cut_off(windows.data + windows.added, windows.valid, beside, noise)[0]
     each, far = np.arange(precision.shape[1]), True
     for step in range(_STEPS):
         shapes = shapes_of(common.optics, common.spot, cols - local[:, :1], rows - local[:, 1:], radius)

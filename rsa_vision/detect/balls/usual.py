@@ -8,7 +8,7 @@ import numpy as np
 
 from rsa_vision.detect.balls.alike import robust_sd, true_spread
 from rsa_vision.detect.balls.fits import BallFits
-from rsa_vision.types import Float, Int
+from rsa_vision.types import Bool, Float, Int
 
 _ANYTHING = 9.0  # spread of logarithms: no two balls need be alike
 _LEAST_BALLS = 5  # whose depths tell how they go with the background
@@ -131,6 +131,10 @@ class Proportion:
     def rows(self, which: Int) -> Proportion:
         """Return those that ``which`` selects."""
         return Proportion(self.slope[which], self.sd[which])
+
+    def but_of_hidden(self, hidden: Bool) -> Proportion:
+        """Return the same, but not for these: slopes of a background that is not seen are none to be told, and would bend rims."""
+        return Proportion(np.where(hidden, 0.0, self.slope), np.where(hidden, np.hypot(self.slope, self.sd), self.sd))
 
 
 def proportion(depth: Float, background: Float, beside: Float, at: Float) -> Proportion:

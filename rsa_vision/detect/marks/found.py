@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.crowd import lost_in_a_crowd, out_of_a_crowd
 from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, are_balls, faint_beside, look_clear, show_what_marks_are_like
-from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, fit_at, misfit, plausible
+from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, fit_at, misfit, plausible, short_of_end
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
@@ -306,7 +306,7 @@ def _measured(
     lone = np.flatnonzero(~around.rowed)  # these alone say what balls are like
     single = balls.rows(lone)
     poor[lone] = what_is_left(single, under, optics.sigma_px, noise)[1]
-    poor |= covered
+    poor |= covered | short_of_end(balls, noise)
     keep = left < _BENT * MISFIT
     ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
     keep &= ~(poor & ends)

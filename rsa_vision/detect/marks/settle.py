@@ -228,7 +228,7 @@ def _windows(film: NDArray[Any], balls: BallFits, part: Int, half: int, beside: 
         added.reshape(flat),
         (patches.valid & ~doubtful).reshape(flat),
         np.zeros(len(part)),
-        of_depth.rows(part),
+        of_depth.rows(part).but_of_hidden(fits.hidden != 0),
     )
 
 

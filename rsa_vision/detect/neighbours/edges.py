@@ -74,8 +74,9 @@ def beside_edges(
         edged_too.append(np.zeros(len(g), bool))
         beside = all_but(fits, index, optics, needles)
         plain = fits.rows(index)
-        # a size at the limit is not fitted: nothing that comes to rest there is a ball
-        if len(g) > MOST_IN_GROUP or not worth[index].any() or (plain.radius_px >= RADIUS_PX[1]).any():
+        # a size at the limit is not fitted: nothing that comes to rest there is a ball. Saturated film shows no edges
+        at_limit, burnt = (plain.radius_px >= RADIUS_PX[1]).any(), (plain.hidden != 0).all()
+        if len(g) > MOST_IN_GROUP or not worth[index].any() or at_limit or burnt:
             parts.append(plain)
             continue
         foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside, spot) / noise.correlation.sum()

@@ -154,6 +154,7 @@ def fit_group(
         significance=np.abs(theta[:k]) / np.sqrt(np.maximum(np.diag(whole)[4 * k :], 1e-30)),
         n_core=inside,
         converged=np.full(k, converged),
+        hidden=np.zeros(k, np.int64),
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.balls.cut_off import grounds_cut_off
 from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.fits import BallFits, half_size, slopes
 from rsa_vision.detect.balls.usual import over_kinds
@@ -33,6 +34,7 @@ _MUCH_LEFT, _MORE_LEFT, _SURE_OF_MORE = 3.0, 1.6, 28.0
 _QUIET = 0.5  # chi2 beside balls: filters that leave less noise there than under them make outlines as well
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
+_BENDS = np.arange(7, 12)  # of what is fitted: slopes and bends of the background
 _STEP_PX = 0.1  # for derivatives
 
 
@@ -78,6 +80,9 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
         much_left, more_left = (balls.chi2_core > times * usually for times in (_MUCH_LEFT, _MORE_LEFT))
         left = (much_left & (chance > _SURE)) | (more_left & (beyond > _SURE_OF_MORE))
         told |= left & (length > _LEAST_OF_LARGER) & (np.median(balls.chi2_ring) > _QUIET)
+    if np.count_nonzero(hidden := balls.hidden != 0) >= _OF_A_KIND:  # backgrounds that are not seen bend as an outline would have them
+        left = balls.chi2_core > _MUCH_LEFT * np.median(balls.chi2_core[hidden])
+        told = np.where(hidden, (left | (length > _LEAST)) & (chance > _BEYOND_DOUBT * usual), told)
     if most or len(told) < _LEAST_KNOWN:
         told |= much
     if most:
@@ -118,7 +123,10 @@ def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optic
         root = np.sqrt(valid / noise.variance_at(fits.background[:, None] + fits.depth[:, None] * value))
         white = whiten_rows(images * root[:, None], side, noise)
         left = whiten_rows((data - fits.background[:, None] - fits.depth[:, None] * value) * root, side, noise)
-        inverse = invert(np.matmul(white, white.swapaxes(1, 2)))
+        normal = np.matmul(white, white.swapaxes(1, 2))
+        outside = reach > (fits.radius_px + optics.sigma_px)[:, None]
+        normal[:, _BENDS, _BENDS] += grounds_cut_off(patches.values.reshape(len(index), -1), valid, outside, noise)[0]
+        inverse = invert(normal)
         change = np.matmul(inverse, np.matmul(white, left[:, :, None]))[:, :, 0]
         out[index], covariance[index] = change[:, 3:5], inverse[:, 3:5, 3:5]
     return out, covariance

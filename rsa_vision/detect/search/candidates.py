@@ -153,12 +153,14 @@ def _carried_on(image: NDArray[Any], noise: NoiseModel) -> tuple[NDArray[Any], N
     if np.count_nonzero(beyond) < LARGEST**2:
         return image, None
     square = np.ones((LARGEST, LARGEST), np.uint8)  # the cores of marks have no room for it; pixels beside what has lie half in it
-    area = cv2.dilate(cv2.morphologyEx(beyond, cv2.MORPH_OPEN, square), np.ones((3, 3), np.uint8))
-    film = area == 0
-    count, part = cv2.connectedComponents(film.view(np.uint8))
-    # marks on a background that is saturated are islands in it, and no film
-    if film.all() or len(np.unique(part[cv2.erode(film.view(np.uint8), square) > 0])) < count - 1:
+    opened = cv2.morphologyEx(beyond, cv2.MORPH_OPEN, square)
+    # marks on a background that is saturated are islands in it, and no film; of some no more is seen than four such pixels
+    lands = cv2.erode(1 - opened, np.ones((2, 2), np.uint8))
+    count, part = cv2.connectedComponents(lands)
+    if lands.all() or len(np.unique(part[cv2.erode(lands, square) > 0])) < count - 1:
         return image, None
+    area = cv2.dilate(opened, np.ones((3, 3), np.uint8))
+    film = area == 0
     distance, nearest = cv2.distanceTransformWithLabels(area, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     weight = cv2.blur(film.astype(np.float32), (SMOOTH, SMOOTH))
     smooth = cv2.blur(np.where(film, image, 0).astype(np.float32), (SMOOTH, SMOOTH))
