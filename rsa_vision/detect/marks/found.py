@@ -297,9 +297,9 @@ def _measured(
         noise, under = curve, 1.0
     bent, under_one_curve = under_curve(film, known, found.edged, clear, _undisturbed(found, optics), optics, noise, painted)
     found = replace(found, fits=bent, edged=found.edged & ~under_one_curve)
-    balls, ratio, by_size, covered = settle(film, found, around.places, under, free, beside, optics, noise)
+    balls, ratio, besides, covered = settle(film, found, around.places, under, free, beside, optics, noise)
     balls, added = _by_lines(Marks(film, balls, others, painted, optics, noise), clear, around.places, under)
-    added[: len(by_size)] += by_size[:, None, None] * np.eye(2)
+    added[: len(besides)] += besides[:, None, None] * np.eye(2)
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
         touching = touching | over_arms(balls, painted)
     left, poor = what_is_left(balls, under, optics.sigma_px, noise)

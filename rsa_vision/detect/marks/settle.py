@@ -87,8 +87,9 @@ def settle(
         With new centres, their covariances, and what is left of the windows.
     ratio : ndarray of shape (n,)
         Squared errors that free places would make of these centres over those that the covariances promise.
-    by_size : ndarray of shape (n,)
-        Variance of centres whose balls are of a size of their own, px^2, as of :func:`rsa_vision.detect.balls.usual.size_unlike`.
+    besides : ndarray of shape (n,)
+        Variance of centres that is none by noise, px^2: of balls that are of a size of their own, as of
+        :func:`rsa_vision.detect.balls.usual.size_unlike`, and of those in saturated film.
     covered : ndarray of bool, shape (n,)
         Something else lies on nearly all of it.
     """
@@ -123,10 +124,10 @@ def settle(
         last = fit(*(replace(common, more=more) for common in (alike, by_spot)))
     out = last.balls
     out.covariance[:, :2, :2] += found.by_spot
-    by_size = np.zeros(len(free))
+    besides = last.by_light
     for kind, usual_ones in ((edged & ~drawn, clear), (edged & drawn, clear_drawn)):
-        by_size[kind] = size_unlike(balls.rows(kind), usual_ones)
-    return out, ratio, by_size, last.covered > MOST_COVERED
+        besides[kind] += size_unlike(balls.rows(kind), usual_ones)
+    return out, ratio, besides, last.covered > MOST_COVERED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,6 +137,7 @@ class _Fitted:
     balls: BallFits
     ratios: list[Float]  # of squared errors at the places, (k, 1) for each size
     covered: Float  # (n,), part of a ball on which something else lies
+    by_light: Float  # (n,), variance of those in saturated film
     left: list[Left]  # by clear balls
     specks: list[Specks]
 
@@ -154,7 +156,7 @@ def _fitted(
 ) -> _Fitted:
     balls, edged, drawn = found.fits, found.edged, found.drawn
     noise, under, curve = alike.noise, alike.under, curve_of(film)
-    out, ratios, covered = replace(balls, covariance=under * balls.covariance), [], np.zeros(len(free))
+    out, ratios, (covered, by_light) = replace(balls, covariance=under * balls.covariance), [], np.zeros((2, len(free)))
     left, every, louder, stayed = list[Left](), list[Specks](), list[Float](), np.ones(len(free), bool)
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
@@ -168,7 +170,7 @@ def _fitted(
             every.append(specks)
             fits = _fits(windows, solution, specks, known, common)
             better = (balls.chi2_uneven[part] - fits.chi2_uneven) / noise.scatter(fits.n_core)
-            covered[part] = windows.covered
+            covered[part], by_light[part] = windows.covered, _by_light(windows, solution, curve)
             crossed, apart = (windows.covered > 0) & (windows.covered <= MOST_COVERED), fits.position_px - balls.position_px[part]
             both = OF_SHIFT * apart[:, :, None] * apart[:, None] * edged[part, None, None]  # both models could be right
             both += OF_SHIFT * ((apart**2).sum(axis=1) * crossed)[:, None, None] * np.eye(2)  # what lies on a ball has any profile
@@ -203,7 +205,7 @@ def _fitted(
         ratios.append(errors)
     if louder:
         out.covariance[stayed] *= np.median(np.concatenate(louder))
-    return _Fitted(out, ratios, covered, left, every)
+    return _Fitted(out, ratios, covered, by_light, left, every)
 
 
 def _batches(drawn: Bool, alike: Common, by_spot: Common) -> Iterator[tuple[Int, Common]]:
@@ -308,6 +310,17 @@ def _hidden(windows: Windows, found: Solution, curve: Curve, common: Common) -> 
     unseen = offset * unseen_slope(fits.background, windows.half, curve, common.noise)[:, None]
     shown_more = np.stack([shown(values, fits.background, change, curve, common.noise) for change in (found.back, *unseen)], axis=2)
     return _by(np.matmul(found.estimator, shown_more), np.ones((len(values), 3)))
+
+
+def _by_light(windows: Windows, found: Solution, curve: Curve) -> Float:
+    """Variance by slopes of light of which nothing is seen but what balls in saturated film leave of it, shape (n,).
+
+    As steep as the light is elsewhere, a ball leaves less of it by the same part.
+    """
+    fits, side = windows.fits, 2 * windows.half + 1
+    offset = np.mgrid[0:side, 0:side].reshape(2, 1, -1)[::-1] - found.local_px.T[:, :, None]
+    behind = np.where(fits.hidden != 0, curve.shading * fits.depth, 0.0)[:, None] * found.images[:, 3]
+    return np.asarray(0.5 * np.square(np.matmul(found.estimator, np.stack(list(offset * behind), axis=2))).sum(axis=(1, 2)))
 
 
 def _surprise(apart: Float, efficient: Float, plain: Float) -> Float:

@@ -98,8 +98,7 @@ def table_of(
     n, m = len(balls.depth), len(needles)
     position = np.concatenate([balls.position_px, np.array([t.position_px for t in needles]).reshape(-1, 2)])
     # a model that leaves more than the noise has errors of its own: they widen the statement, once they are significant
-    # those that are the same on opposite sides spare a centre only where both sides are seen
-    left = np.where(balls.valid_fraction < CUT_OFF, np.maximum(balls.chi2_core, balls.chi2_uneven), balls.chi2_uneven) / usual
+    left = balls.chi2_uneven / usual
     excess = np.where(left > 1 + CHANCE * noise.scatter(balls.n_core), left, 1.0)
     # structure around a ball that its background does not hold goes on under it
     excess = np.maximum(excess, np.where(balls.chi2_ring > STRUCTURE, balls.chi2_ring, 0.0)) * ratio
