@@ -10,11 +10,11 @@ from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored, strip
 
-SIDE, SIGMA_PX, RADIUS_PX = 760, 1.4, 4.0
+SIDE, SIGMA_PX, RADIUS_PX = 560, 1.4, 4.0
 DEPTH, CNR, NOISE_BLUR_PX = 0.45, 15.0, 0.8
 BACKGROUND = 30000.0
 FILMS = 2
-MOST_FALSE, LEAST_FOUND = 2, 0.95  # of a film with 32 wires; there were 9 to 13
+MOST_FALSE, LEAST_FOUND = 1, 0.95  # of a film with 16 wires; there were 4 to 6
 FAR = 4.5
 
 
@@ -23,7 +23,7 @@ def film_with_wires(rng: np.random.Generator, faint: float = 0.0) -> tuple[Float
 
     ``faint``: every third ball lies on no wire and has so much of the contrast.
     """
-    truth, radius = grid_of_balls(rng, 7, 100.0, (RADIUS_PX, RADIUS_PX))
+    truth, radius = grid_of_balls(rng, 5, 100.0, (RADIUS_PX, RADIUS_PX))
     bare = np.arange(len(truth)) % 3 == 0
     depth = np.where(bare & (faint > 0), faint * DEPTH, DEPTH)
     film = film_of_balls((SIDE, SIDE), truth, radius, background=BACKGROUND, depth=depth, sigma_px=SIGMA_PX)
