@@ -115,9 +115,10 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     left = misfit(fits, noise, CHANCE)
     # little is left of the window beside a saturated area: enough if the ball itself is whole, or what is seen of it a ball's to the last
     # per cent; of a ball that is cut off, its rim
-    whole = fits.valid_fraction > np.where((left < _CAP_MISFIT * slack) & (fits.significance > _CAP_SURE), _CAP, 0.6)
+    like_a_cap = (left < _CAP_MISFIT * slack) & (fits.significance > _CAP_SURE)
+    whole = fits.valid_fraction > np.where(like_a_cap, _CAP, 0.6)
     seen = ((fits.valid_fraction > 0.1) & (fits.window_fraction > 0.5)) | (whole & (fits.window_fraction > 0.05))
-    seen |= (left < _CAP_MISFIT * slack) & (fits.significance > _CAP_SURE) & (fits.n_core >= _CAP_PIXELS) & ~short_of_end(fits, noise)
+    seen |= like_a_cap & (fits.n_core >= _CAP_PIXELS) & (fits.hidden != 0) & ~short_of_end(fits, noise)
     seen &= fits.hidden * fits.depth <= 0  # beyond the upper end only dark marks can be, beyond the lower one bright ones
     usable = seen & np.isfinite(fits.position_px).all(1)
     # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
