@@ -77,7 +77,7 @@ def test_a_dozen_pixels_of_each_are_enough(radius_px: float, air: float) -> None
         miss, error = misses(found.images, burnt)
         print(f"RMS {ratio(miss) / np.sqrt(2):.4f} px, error / sd {ratio(error):.2f}")
         assert miss.max() < 0.1
-        assert error.max() < 6
+        assert error.max() < 4
         flags = [found.images.flags[np.hypot(*(found.images.position_px - ball).T).argmin()] for ball in burnt]
         assert all(flag & MarkerFlag.CLIPPED for flag in flags)
 

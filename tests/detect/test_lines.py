@@ -14,7 +14,7 @@ SIDE, SIGMA_PX, RADIUS_PX = 560, 1.4, 4.0
 DEPTH, CNR, NOISE_BLUR_PX = 0.45, 15.0, 0.8
 BACKGROUND = 30000.0
 FILMS = 2
-MOST_FALSE, LEAST_FOUND = 1, 0.95  # of a film with 16 wires; there were 4 to 6
+MOST_FALSE, LEAST_FOUND = 1, 0.95  # of a film with 16 wires; of 32 there were 9 to 13
 FAR = 4.5
 
 

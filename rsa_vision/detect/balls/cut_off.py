@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -37,9 +38,8 @@ def depths_cut_off(values: Float, valid: Bool, inside: Bool, noise: NoiseModel) 
         0 for all others.
     """
     known, expected = np.zeros((2, len(values)))
-    for _, beyond, room in _ends(values, valid, noise):
-        cut = (beyond & inside).sum(axis=1) > _CUT_OFF * inside.sum(axis=1)
-        expected[cut], known[cut] = _DEEPER * room[cut], (_DEEPER_SD * room[cut]) ** -2.0
+    for _, cut, room in _cut_off(values, valid, inside, _CUT_OFF, noise):
+        expected[cut], known[cut] = _DEEPER * room, (_DEEPER_SD * room) ** -2.0
     return known, expected
 
 
@@ -65,17 +65,19 @@ def grounds_cut_off(values: Float, valid: Bool, beside: Bool, noise: NoiseModel)
         1 where it is the upper end, -1 where it is the lower one, 0 where backgrounds are seen.
     """
     held, hidden = np.zeros((len(values), 5)), np.zeros(len(values), np.int64)
-    for sign, beyond, room in _ends(values, valid, noise):
-        cut = (beyond & beside).sum(axis=1) > _HIDDEN * beside.sum(axis=1)
-        held[cut] = (np.concatenate([_SLOPES, _BENDS]) * room[cut, None]) ** -2.0
+    for sign, cut, room in _cut_off(values, valid, beside, _HIDDEN, noise):
+        held[cut] = (np.concatenate([_SLOPES, _BENDS]) * room[:, None]) ** -2.0
         hidden[cut] = sign
     return held, hidden
 
 
-def _ends(values: Float, valid: Bool, noise: NoiseModel) -> list[tuple[int, Bool, Float]]:
-    """What lies at either end of the range, if it cuts anything off, and how far that is from what is seen; (n, p) and (n,)."""
-    ends = [(sign, end) for sign, end in ((-1, noise.floor), (1, noise.ceiling)) if np.isfinite(end)]
-    if not ends:
-        return []
-    middle = np.array([np.median(of[seen]) if seen.any() else np.nan for of, seen in zip(values, valid, strict=True)])
-    return [(sign, (sign * values >= sign * end) & np.isfinite(middle)[:, None], end - middle) for sign, end in ends]
+def _cut_off(values: Float, valid: Bool, there: Bool, most: float, noise: NoiseModel) -> Iterator[tuple[int, Int, Float]]:
+    """Yield for each end of the range, -1 or 1, the windows (k,) of which it cuts off more than that part there, and the room up to it.
+
+    That is how far it is from the median of what is seen, (k,).
+    """
+    for sign, end in ((-1, noise.floor), (1, noise.ceiling)):
+        if np.isfinite(end):
+            beyond = sign * values >= sign * end
+            cut = np.flatnonzero(((beyond & there).sum(axis=1) > most * there.sum(axis=1)) & valid.any(axis=1))
+            yield sign, cut, end - np.array([np.median(values[k, valid[k]]) for k in cut])
