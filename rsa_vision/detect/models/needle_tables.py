@@ -40,34 +40,18 @@ def _opacity(
 ) -> Single:
     """Blurred opacity of a needle so many times wider and longer, on the grid for one of this half width and length stretched with it.
 
-    A ray in depth ``z`` of the needle crosses it at the distance ``s + sqrt(slant) z`` from the tip; of its chord only the part before the
-    flat end counts. The middle of the chord lies the further behind the further it is from the axis: ``skew`` times the distance.
     What is uneven of the blur is that along the needle against across, and the covariance of both.
     """
     cell = cell_of(optics.sigma_px)
-    first, (n_s, n_p) = _grid(half_width, length, optics.sigma_px)
     cell_s, cell_p = cell * longer, cell * wider
-    s = first[0] * longer + cell_s * np.arange(n_s)
+    if slant or skew:
+        opacity = _unblurred(half_width, length, taper, optics.sigma_px, optics.mu_px, slant, skew, wider, longer)
+    else:  # stretched with its grid a needle is the same, but for how thick it is
+        opacity = _unblurred(half_width, length, taper, optics.sigma_px, optics.mu_px * wider)
     along, oblique = optics.uneven
-    mirrored = not (skew or oblique)  # one half is enough
-    p = cell_p * np.arange(n_p // 2 + 1) if mirrored else first[1] * wider + cell_p * np.arange(n_p)
-    s, p = s.astype(np.float32), p.astype(np.float32)
-    half_width, length = half_width * wider, length * longer
-    # where the needle is, with what rays that cross its end aslant see of it; only blur comes to the other nodes
-    far = length + (math.sqrt(slant) + abs(skew)) * half_width
-    rows, cols = (
-        slice(*np.searchsorted(at, (low - step, high + step)))
-        for at, step, low, high in ((s, cell_s, 0, far), (p, cell_p, -half_width, half_width))
-    )
-    fine_s, fine_p = ((at[:, None] + step * (np.arange(2) - 0.5) / 2).ravel() for at, step in ((s[rows], cell_s), (p[cols], cell_p)))
-    width = half_width * np.clip(fine_s[:, None] / (taper * length), 0.0, 1.0)
-    chord = 2 * np.sqrt(np.maximum(width**2 - fine_p**2, 0.0))
-    before = length - fine_s[:, None] - skew * fine_p
-    if slant:
-        chord *= np.clip(0.5 + before / (np.sqrt(slant) * np.maximum(chord, 1e-9)), 0.0, 1.0)
-    fine = -np.expm1(-optics.mu_px * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
-    opacity = np.zeros((n_s, len(p)), np.float32)
-    opacity[rows, cols] = (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2]) / 4
+    mirrored = not (skew or oblique)
+    if oblique and not skew:
+        opacity = _unfolded(opacity)
 
     bends = any((*optics.curve, optics.logged))  # if not, it does not matter when it is blurred
     late = optics.late * (blurrier * optics.sigma_px) ** 2 if bends else 0.0
@@ -84,7 +68,54 @@ def _opacity(
         seen = film_curve(seen, optics.curve).astype(np.float32)
     if late:
         seen = _blurred_late(seen, optics.logged, (1.0, late / cell_s**2, late / cell_p**2, 0.0), mirrored=mirrored)
-    return np.concatenate([seen[:, :0:-1], seen], axis=1) if mirrored else seen
+    return _unfolded(seen) if mirrored else seen
+
+
+def _unfolded(half: Single) -> Single:
+    """Return both halves of what is the same on either side of the axis, which is the first column."""
+    return np.concatenate([half[:, :0:-1], half], axis=1)
+
+
+@lru_cache(maxsize=256)
+def _unblurred(
+    half_width: float,
+    length: float,
+    taper: float,
+    sigma: float,
+    mu: float,
+    slant: float = 0.0,
+    skew: float = 0.0,
+    wider: float = 1.0,
+    longer: float = 1.0,
+) -> Single:
+    """Opacity on the grid for this blur, before it; of what is the same on either side of the axis one half.
+
+    A ray in depth ``z`` of the needle crosses it at the distance ``s + sqrt(slant) z`` from the tip; of its chord only the part before the
+    flat end counts. The middle of the chord lies the further behind the further it is from the axis: ``skew`` times the distance.
+    """
+    cell = cell_of(sigma)
+    first, (n_s, n_p) = _grid(half_width, length, sigma)
+    cell_s, cell_p = cell * longer, cell * wider
+    s = first[0] * longer + cell_s * np.arange(n_s)
+    p = first[1] * wider + cell_p * np.arange(n_p) if skew else cell_p * np.arange(n_p // 2 + 1)
+    s, p = s.astype(np.float32), p.astype(np.float32)
+    half_width, length = half_width * wider, length * longer
+    # where the needle is, with what rays that cross its end aslant see of it; only blur comes to the other nodes
+    far = length + (math.sqrt(slant) + abs(skew)) * half_width
+    rows, cols = (
+        slice(*np.searchsorted(at, (low - step, high + step)))
+        for at, step, low, high in ((s, cell_s, 0, far), (p, cell_p, -half_width, half_width))
+    )
+    fine_s, fine_p = ((at[:, None] + step * (np.arange(2) - 0.5) / 2).ravel() for at, step in ((s[rows], cell_s), (p[cols], cell_p)))
+    width = half_width * np.clip(fine_s[:, None] / (taper * length), 0.0, 1.0)
+    chord = 2 * np.sqrt(np.maximum(width**2 - fine_p**2, 0.0))
+    before = length - fine_s[:, None] - skew * fine_p
+    if slant:
+        chord *= np.clip(0.5 + before / (np.sqrt(slant) * np.maximum(chord, 1e-9)), 0.0, 1.0)
+    fine = -np.expm1(-mu * chord) * (1.0 if slant else np.clip(0.5 + before / (cell_s / 2), 0.0, 1.0))
+    opacity = np.zeros((n_s, len(p)), np.float32)
+    opacity[rows, cols] = (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2]) / 4
+    return opacity
 
 
 def _blurred_late(shown: Single, logged: float, light: tuple[float, float, float, float], *, mirrored: bool) -> Single:
@@ -156,32 +187,36 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
     """
     one = half_width, length, taper, optics, slant
     base = _opacity(*one)
-    nodes = [
-        base,
-        (_opacity(*one, wider=GRID) - base) / ((GRID - 1) * half_width),
-        (_opacity(*one, longer=GRID) - base) / ((GRID - 1) * length),
-    ]
-    if more == "ends":
-        nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
-    nodes += np.gradient(base, cell_of(optics.sigma_px))
     if more == "optics":
-        factor = float(np.exp(STEP))
-        dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
-        wide, short = _opacity(*one, blurrier=factor), _opacity(half_width, length, taper - STEP, optics, slant)
-        along, oblique = optics.uneven
-        others = [
-            replace(optics, tail=optics.tail + STEP),
-            replace(optics, late=optics.late + STEP),
-            replace(optics, logged=optics.logged + STEP),
-            replace(optics, uneven=(along + STEP, oblique)),
-            replace(optics, uneven=(along, oblique + STEP)),
-        ]
-        straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0), logged=0.0), slant)
-        nodes = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP, *by_film_curve(straight, optics.curve)]
-        nodes += [(_opacity(half_width, length, taper, other, slant) - base) / STEP for other in others]
+        nodes = _by_optics(base, *one)
+    else:
+        wider, longer = _opacity(*one, wider=GRID), _opacity(*one, longer=GRID)
+        nodes = [base, (wider - base) / ((GRID - 1) * half_width), (longer - base) / ((GRID - 1) * length)]
+        if more == "ends":
+            nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
+        nodes += np.gradient(base, cell_of(optics.sigma_px))
     values = np.array(nodes, np.float32)
     values[:, [0, -1]] = values[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return values
+
+
+def _by_optics(base: Single, half_width: float, length: float, taper: float, optics: Optics, slant: float) -> list[Single]:
+    factor = float(np.exp(STEP))
+    dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
+    wide = _opacity(half_width, length, taper, optics, slant, blurrier=factor)
+    short = _opacity(half_width, length, taper - STEP, optics, slant)
+    straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0), logged=0.0), slant)
+    along, oblique = optics.uneven
+    others = [
+        replace(optics, tail=optics.tail + STEP),
+        replace(optics, late=optics.late + STEP),
+        replace(optics, logged=optics.logged + STEP),
+        replace(optics, uneven=(along + STEP, oblique)),
+        replace(optics, uneven=(along, oblique + STEP)),
+    ]
+    steps = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
+    by_curve = [np.asarray(of, np.float32) for of in by_film_curve(straight, optics.curve)]
+    return [*steps, *by_curve, *((_opacity(half_width, length, taper, other, slant) - base) / STEP for other in others)]
 
 
 def look_up(values: Single, at_s: Float, at_p: Float) -> Float:
