@@ -189,7 +189,8 @@ def optics_of_pins(film: NDArray[Any], rough: list[NeedleFit], noise: NoiseModel
     """
     if not rough:
         return replace(GUESS, rough=True), 0.0
-    trials = [replace(GUESS, sigma_px=sigma, rough=True) for sigma in BLURS_PX]
+    nearest_first = sorted(BLURS_PX, key=lambda sigma: abs(sigma - GUESS.sigma_px))
+    trials = [replace(GUESS, sigma_px=sigma, rough=True) for sigma in nearest_first]
     optics, _, sample = _likeliest(film, rough[:_SAMPLE], trials, noise)
     return optics, float(sum(min(f.significance, CAP) for f in sample if is_pin(f, noise)))
 
@@ -199,27 +200,42 @@ def _likeliest(
 ) -> tuple[Optics, float, list[NeedleFit]]:
     """Choose of these optics and tapers those with which pins leave least, each of them on the same pixels.
 
-    What no pin explains has a say that is bounded.
+    From the first on, blurs are tried that are ever sharper, and ever wider, until they leave more. What no pin explains has a say that is
+    bounded.
     """
     widest = max(trials, key=lambda optics: optics.sigma_px)
     windows = [window_of(film, [f], widest, noise, None) for f in sample]
     pixels = np.array([len(window.data) for window in windows])
-    fits, chi2 = {}, {}
+    fits: dict[tuple[Optics, float], list[NeedleFit]] = {}
+    chi2: dict[tuple[Optics, float], Float] = {}
 
     def worse(left: Float, other: Float) -> float:
         scale = np.maximum(np.minimum(left, other) / pixels, 1.0)
         by = np.clip((left - other) / (2 * scale), -SURER_THAN_ROD, SURER_THAN_ROD)
         return float((by / scale).sum())
 
-    for optics in trials:
-        tried, last = sample, None
+    def tapered(optics: Optics, tried: list[NeedleFit]) -> Float:
+        """Fit with one taper after the other until they leave more; return what the best leaves."""
+        least = np.full(len(tried), np.inf)
         for taper in tapers:  # each from the one before: a cone is longer than the pin with a short point that it stands for
             tried = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in tried]
             left = np.array([chi2_of(window, f, optics, noise) for window, f in zip(windows, tried, strict=True)])
             fits[optics, taper], chi2[optics, taper] = tried, left
-            if last is not None and worse(left, last) > 0:
+            if worse(left, least) > 0:
                 break
-            last = left
+            least = left
+        return least
+
+    by_blur = sorted(trials, key=lambda optics: optics.sigma_px)
+    start = by_blur.index(trials[0])
+    at_start = tapered(trials[0], sample)
+    for way in (by_blur[start + 1 :], by_blur[:start][::-1]):
+        last, tried = at_start, fits[trials[0], tapers[0]]
+        for optics in way:
+            left = tapered(optics, tried)
+            if worse(left, last) > 0:
+                break
+            last, tried = left, fits[optics, tapers[0]]
     least = np.min(list(chi2.values()), axis=0)
     best = min(chi2, key=lambda trial: worse(chi2[trial], least))
     return *best, fits[best]
