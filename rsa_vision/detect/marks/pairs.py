@@ -25,7 +25,7 @@ _STRONGEST = 24  # candidates that are asked where there is no seed
 _FEW = 8  # of the seeds, asked first
 _ASKED, _AT_FIRST = 4, 2  # surest blobs; those asked while the blur is anybody's
 _ROUGH_STEPS = 10  # of these: most pairs need eight, what is none does not come to rest
-_COARSE = 2.0  # the same of pairs at a blur that is nearly right
+_COARSE, _NEAR = 2.0, 1.5  # times the misfit of pairs, of rough ones and at a blur that is nearly right
 _FINER = (0.76, 0.87, 1.0, 1.15, 1.32)  # steps of the blur around the best of the coarse ones
 _WIDE = 1.5  # times the radius of a blob: what is looked at of pairs
 _ALIKE = 0.2  # logarithm of the radii of two balls in one
@@ -86,6 +86,8 @@ def optics_of_pairs(
     if not any(_are_two(pair, blob, noise, _COARSE) for pair, blob in zip(trials[int(np.argmin(costs))], blobs, strict=False)):
         return None
     sigma = refine(SIGMAS_PX, costs)
+    if not any(_are_two(pair, blob, noise, _NEAR) for pair, blob in zip(as_two(sigma), blobs, strict=True)):
+        return None
     finer = tuple(sigma * step for step in _FINER)
     sigma = refine(finer, [left(as_two(sigma), sigma) for sigma in finer])
     found = [pair for pair, blob in zip(as_two(sigma), blobs, strict=True) if _are_two(pair, blob, noise)]
