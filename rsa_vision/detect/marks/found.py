@@ -52,6 +52,7 @@ _AT_NEEDLES = 1.5  # of their lengths, from the tip: what the search answers to 
 _SMOOTHED, _MUCH_MORE = 1.15, 2.0  # blur of the noise over that of the marks, noise under these over that beside them, from which one did
 _USUAL_BLUR = 0.6  # of the noise at marks, over theirs
 _BESIDE = 2.0, 3.0  # of the radius of a ball, and pixels more, within which the search answers to it
+_MOST_IN_VAIN = 6  # tees that balls may hide, where there is no other
 _BENT = 1.5  # of what a ball may leave, once an edge or bending surfaces around it could have taken it up
 
 
@@ -236,7 +237,9 @@ def _taken_apart(film: NDArray[Any], found: Balls, needles: _Needles, optics: Op
         return lambda cols, rows: painted(cols, rows) - needle_image(cols - tee.position_px[0], rows - tee.position_px[1], tee, tee_optics)
 
     tried = [(tee, without(tee)) if odd else (tee, None) for tee, odd in zip(needles.tees, poor, strict=True)]
-    for tee, beside in [*tried, *((tee, painted) for tee in needles.doubtful)]:
+    for k, (tee, beside) in enumerate([*tried, *((tee, painted) for tee in needles.doubtful)]):
+        if k == _MOST_IN_VAIN and not tees:
+            break  # where nothing is a tee, what might be one under a ball is a screw
         places, both = found.fits.position_px, None
         on = places[found.touching & on_arms(places, [tee])]
         if beside and len(on) < 2:
