@@ -13,7 +13,7 @@ from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored
 
-SIDE, SIGMA_PX, RADIUS_PX = 700, 1.4, 4.0
+SIDE, SIGMA_PX, RADIUS_PX = 610, 1.4, 4.0
 BACKGROUND, DEPTH, CNR = 30000.0, 0.45, 30.0
 FILMS = 2
 FAR, MOST_FAR = 4.0, 0.03
@@ -43,7 +43,7 @@ def test_balls_under_faults_are_found_and_their_errors_stated(fault: Callable[[F
     count = 0
     for seed in range(FILMS):
         rng = np.random.default_rng(70 + seed)
-        truth, radius = grid_of_balls(rng, 7, 90.0, (RADIUS_PX, RADIUS_PX))
+        truth, radius = grid_of_balls(rng, 6, 90.0, (RADIUS_PX, RADIUS_PX))
         noise_sd = BACKGROUND * DEPTH / CNR
         film = film_of_balls((SIDE, SIDE), truth, radius, background=BACKGROUND, depth=DEPTH, sigma_px=SIGMA_PX, noise_sd=noise_sd, rng=rng)
         hit = truth[np.arange(len(truth)) % 3 > 0]

@@ -17,14 +17,16 @@ from .films import stored
 
 def trabeculae(rng: np.random.Generator) -> NDArray[np.uint16]:
     """Struts of many lengths and depths on a film of nothing else, and as much noise as hides what a mark looks like."""
-    fine = np.zeros((1200, 1200), np.float32)
+    fine, strut = np.zeros((2, 1200, 1200), np.float32)
     for _ in range(1800):
         at, turn, length = rng.uniform(100, 1100, 2), rng.normal(0.8, 0.5) * rng.choice([-1, 1]), rng.uniform(8, 45)
         way = length / 2 * np.array([np.cos(turn), np.sin(turn)])
         ends = (tuple(np.rint(16 * (at + sign * way)).astype(int).tolist()) for sign in (-1, 1))
-        strut = np.zeros_like(fine)
         cv2.line(strut, *ends, float(rng.uniform(0.2, 1.0)), int(rng.integers(1, 5)), cv2.LINE_AA, 4)
-        fine += strut
+        (left, top), reach = np.rint(at).astype(int) - 40, 81
+        around = np.s_[top : top + reach, left : left + reach]
+        fine[around] += strut[around]
+        strut[around] = 0.0
     clear = np.exp(-0.04 * gaussian_filter(fine, 2.2).reshape(600, 2, 600, 2).mean((1, 3)))
     return stored(30000 * clear + 150 * rng.standard_normal(clear.shape), 16)
 

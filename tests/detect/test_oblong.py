@@ -12,7 +12,7 @@ from .films import film_of_balls, grid_of_balls, stored
 
 SIDE, CELL = 600, 60.0
 RADII = 3.0, 3.75
-FILMS = 6
+FILMS = 4
 
 
 @pytest.mark.parametrize("cnr", [10.0, 15.0])

@@ -11,7 +11,7 @@ from rsa_vision.types import Float, MarkerImages
 
 from .films import film_of_balls, stored
 
-SIDE, BACKGROUND, DEPTH, FILMS = 260, 30000.0, 0.5, 3
+SIDE, BACKGROUND, DEPTH, FILMS = 260, 30000.0, 0.5, 2
 
 
 def film_of_pairs(seed: int, radius_px: float, apart: float, cnr: float) -> tuple[Float, Float]:

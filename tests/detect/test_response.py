@@ -41,8 +41,7 @@ def errors(images: MarkerImages, truth: Float) -> tuple[Float, Float]:
     return gap.min(axis=1), np.sqrt(square)
 
 
-@pytest.mark.parametrize("bits", [12, 16])
-@pytest.mark.parametrize("speed", SPEEDS)
+@pytest.mark.parametrize(("speed", "bits"), [*zip(SPEEDS, (12, 16, 12), strict=True)])
 def test_balls_on_films_of_light_are_where_they_are_said_to_be(speed: float, bits: int) -> None:
     away, ratio, away_in_light = [], [], []
     for seed in (1, 2):

@@ -35,8 +35,7 @@ def screw(tip: tuple[float, float], direction: float) -> NDArray[np.float64]:
     turn = np.where(across > 0, 0.0, 0.5)  # on the other side the crest has gone round by half a turn
     radius = CREST - 2 * DEEP * np.abs((along / PITCH + turn) % 1.0 - 0.5)
     chord = 2 * np.sqrt(np.maximum(radius**2 - across**2, 0.0)) * ((along > 0) & (along < LENGTH))
-    fine = gaussian_filter(np.exp(-OF_METAL * chord), SIGMA_PX * FINE)
-    return np.asarray(fine.reshape(SIZE, FINE, SIZE, FINE).mean(axis=(1, 3)))
+    return np.asarray(np.exp(-OF_METAL * chord))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +43,8 @@ def found() -> list[MarkerImages]:
     """What is found on a film of balls and four screws, and on one of the balls alone."""
     rng = np.random.default_rng(1)
     light = film_of_balls((SIZE, SIZE), BALLS, np.full(len(BALLS), RADIUS_PX), background=1.0, depth=DEPTH, sigma_px=SIGMA_PX)
-    screws = np.prod([screw((90.0, 80.0 + 70 * k), 0.12 - 0.08 * k) for k in range(4)], axis=0)
+    fine = gaussian_filter(np.prod([screw((90.0, 80.0 + 70 * k), 0.12 - 0.08 * k) for k in range(4)], axis=0), SIGMA_PX * FINE)
+    screws = fine.reshape(SIZE, FINE, SIZE, FINE).mean(axis=(1, 3))
     films = [BACKGROUND * part + NOISE * rng.standard_normal((SIZE, SIZE)) for part in (light * screws, light)]
     return [detect_markers(stored(film), bits=16).images for film in films]
 

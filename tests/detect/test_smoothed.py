@@ -30,7 +30,7 @@ def median(film: Film) -> NDArray[Any]:
 def test_errors_are_those_by_the_noise_at_marks(smoothed: Callable[[Film], NDArray[Any]], beyond: float) -> None:
     """They were 4.7 and 1.9 times too small: what is left beside marks is far less, and smoother."""
     z: list[float] = []
-    for seed in range(4):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         balls, radii = grid_of_balls(rng, 6, 85.0, (4.0, 4.0))
         film = film_of_balls(
@@ -40,6 +40,6 @@ def test_errors_are_those_by_the_noise_at_marks(smoothed: Callable[[Film], NDArr
         away, sds = misses(images.rows(images.flags == 0), balls)
         z += sds[away < 1].tolist()
     print(f"{len(z)} balls, error / sd {np.sqrt(np.mean(np.square(z))):.2f}, largest {np.sqrt(2) * max(z):.1f}")
-    assert len(z) > 0.95 * 4 * len(balls)
+    assert len(z) > 0.95 * 3 * len(balls)
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3
     assert np.mean(np.array(z) > 5 / np.sqrt(2)) <= beyond

@@ -18,7 +18,7 @@ from rsa_vision.types import Float
 
 from .films import ATTENUATION, FINE, stored
 
-SIDE, RADIUS_PX, SIGMA_PX, NOISE, FILMS = 300, 6.0, 1.0, 600.0, 4
+SIDE, RADIUS_PX, SIGMA_PX, NOISE, FILMS = 300, 6.0, 1.0, 600.0, 3
 CURVES: dict[str, Callable[[Float], Float]] = {  # film values, of the part of the light that is left
     "linear": lambda light: 10000 + 45000 * light,
     "transmitted light": lambda light: 6000 * light**-1.5,

@@ -17,7 +17,7 @@ from rsa_vision.identify.hypotheses import largest_overlap
 from rsa_vision.types import MarkerImages
 from synthetic.point_films import FilmTruth, expose, random_exposure, random_foci, random_objects
 
-EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "40"))  # of each cage; thousands take minutes
+EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "24"))  # of each cage; thousands take minutes
 
 
 def identify(film: FilmTruth, cage: Cage, foci: tuple[int, ...], **options: object) -> CageIdentification:
@@ -188,14 +188,14 @@ def test_far_focus_is_said() -> None:
 def test_images_of_both_foci_at_any_distance(name: str, gap_mm: float) -> None:
     cage = load_cage(name)
     named = 0
-    for seed in range(8):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         film = expose(cage, (1, 2), random_exposure(rng, cage, gap_mm=gap_mm, missing=0, misread=0.0), rng)
         result = identify(film, cage, (1, 2))
         named += not result.reasons
         if not result.reasons:
             assert film.errors(result.assignments) == [], f"seed {seed}"
-    assert named >= (6 if gap_mm >= 1 else 0)
+    assert named >= (3 if gap_mm >= 1 else 0)
 
 
 def test_foreign_marks_and_parts_of_tees_are_explained() -> None:

@@ -20,7 +20,7 @@ from rsa_vision.identify.packing import pack
 from rsa_vision.identify.pair_looks import log_odds_of_looks
 from rsa_vision.identify.pairs import Pairing, pair_rays
 
-EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "40"))
+EXAMINATIONS = int(os.environ.get("RSA_VISION_EXAMINATIONS", "24"))
 FOCI = {1: np.array([-240.0, 100.0, 1120.0]), 2: np.array([240.0, 100.0, 1120.0]), 3: np.array([0.0, 500.0, 1050.0])}
 
 

@@ -66,8 +66,7 @@ DRAWS = 200
 BAND = (0.88, 1.12)
 
 
-@pytest.mark.parametrize("name", ["1A", "1B", "2"])
-@pytest.mark.parametrize("sd_px", [0.01, 0.1, 1.0])
+@pytest.mark.parametrize(("name", "sd_px"), [("1A", 0.01), ("1A", 0.1), ("1A", 1.0), ("1B", 0.1), ("2", 0.1)])
 def test_drawn_errors_are_as_large_as_stated(name: str, sd_px: float) -> None:
     rng = np.random.default_rng(22)
     cage, foci, objects, points = exposure(name, rng)
