@@ -20,8 +20,7 @@ def shadows(sigma_px: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("sigma_px", [0.6, 1.0, 2.5])
-@pytest.mark.parametrize("bits", [8, 16])
-@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize(("bits", "inverted"), [(8, False), (16, True)])
 @pytest.mark.parametrize("background", [0.7, 1.0])
 def test_balls_on_one_value_are_measured(sigma_px: float, bits: int, inverted: bool, background: float) -> None:
     film = background * shadows(sigma_px)

@@ -40,7 +40,7 @@ def assert_all_are_measured(found: Detection, truth: NDArray[np.float64]) -> Non
 
 
 @pytest.mark.parametrize(("apart", "contrast"), [(0.5, 40.0), (0.65, 12.0)])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_pairs_are_not_taken_for_balls_drawn_by_a_focal_spot(seed: int, apart: float, contrast: float) -> None:
     film, truth, _ = film_of_pairs(seed, apart, contrast)
     assert_all_are_measured(detect_markers(stored(film), bits=16), truth)

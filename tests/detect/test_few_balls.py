@@ -67,7 +67,7 @@ def test_noise_under_a_few_small_faint_balls_is_no_reason_to_lose_them(radius_px
 
 
 @pytest.mark.parametrize("n", [1, 4])
-@pytest.mark.parametrize(("radius_px", "cnr"), [(5.0, 20.0), (8.0, 10.0), (12.0, 10.0), (12.0, 20.0)])
+@pytest.mark.parametrize(("radius_px", "cnr"), [(5.0, 20.0), (8.0, 10.0), (12.0, 20.0)])
 @pytest.mark.parametrize("log", [False, True])
 def test_a_few_large_soft_balls_in_the_noise_of_quanta(log: bool, radius_px: float, cnr: float, n: int) -> None:
     """Where little comes through there is less noise on a linear film, and more on one of the logarithm of the exposure."""

@@ -25,7 +25,7 @@ def light_past_balls(centres: Float) -> Float:
     return clear
 
 
-@pytest.mark.parametrize("across", [0.0, 2.5, -5.0])
+@pytest.mark.parametrize("across", [0.0, -5.0])
 def test_on_arms(across: float) -> None:
     """At 8 to 18 px from the tip, so many pixels beside the middle of the arm."""
     rng = np.random.default_rng(round(10 * across) + 100)

@@ -36,7 +36,7 @@ def surely(images: MarkerImages, truth: Float) -> tuple[int, list[float]]:
 
 @pytest.mark.parametrize(
     ("radius_px", "apart", "cnr"),
-    [(r, d, c) for r in (3.0, 6.0) for d in (0.5, 0.65, 0.8, 1.0) for c in (10.0, 30.0) if (r, d, c) != (3.0, 0.5, 10.0)],
+    [(r, d, c) for r in (3.0, 6.0) for d in (0.5, 0.65, 1.0) for c in (10.0, 30.0) if (r, d, c) != (3.0, 0.5, 10.0)],
 )
 def test_nothing_but_pairs(radius_px: float, apart: float, cnr: float) -> None:
     z2: list[float] = []

@@ -113,7 +113,7 @@ def test_edges_beside_them_are_part_of_their_errors(name: str) -> None:
     assert square[:, 1].max() < 25
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("seed", [3, 4])
 def test_odd_things_that_no_spot_explains_together_are_no_balls(seed: int) -> None:
     """The end of one such rod may look pointed: among balls a pin or two are flagged."""
     rng = np.random.default_rng(seed)
