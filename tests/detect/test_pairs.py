@@ -106,5 +106,5 @@ def test_pairs_of_any_two_sizes_of_a_film_are_told(radii_px: tuple[float, float]
         z2 += square
     ratio = float(np.sqrt(np.mean(z2) / 2))
     print(f"radii {radii_px}, {apart} of their sum apart: {found} of {FILMS * 11} found, error / sd {ratio:.2f}")
-    assert found >= FILMS * 11 - 1
+    assert found == FILMS * 11
     assert ratio < 1.4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,7 @@ def optics_of_pairs(
         return None
     blobs = [single.rows([i]) for i in np.flatnonzero(rest)[:_ASKED]]
 
+    @cache  # the middle one of the finer blurs has been asked before
     def as_two(sigma_px: float, *, rough: bool = False) -> list[BallFits]:
         if rough:
             return [_as_two(film, blob, sigma_px, noise, STRETCH[:1], _ROUGH_STEPS) for blob in blobs[:_AT_FIRST]]
