@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution, weighted_least_squares
+from rsa_vision.detect.film.progress import WEIGHED, in_vain
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image, support
@@ -180,7 +181,7 @@ def fit_crossing(
     steps, near = (min(steps, _QUICK_STEPS), _NEAR_PX) if quick else (steps, _CONVERGED_PX)
     cols, rows, data, surface, half = window.cols, window.rows, window.data, window.surface, window.half
     weight = 1.0 / noise.variance_at(data + window.beside)
-    before, converged = now, False
+    before, converged, left = now, False, list[float]()
     if edge:
         surface = window.with_edge(now, optics).surface
     tees: Float = np.zeros((len(now), 1, len(data)))  # needles, (image, its derivatives), pixels
@@ -194,7 +195,7 @@ def fit_crossing(
         return [scored(f, image, residual, weight, surface, background, variance, window.hidden, optics) for f, image in of_each]
 
     for step in range(steps + 1):
-        last = step == steps or converged  # nobody asks where to go next
+        last = step == steps or converged or in_vain(left, len(data))  # nobody asks where to go next
         if converged:  # so small a step goes into the images linearly
             tees = tees[:, :1] + np.matmul(_change(before, now)[:, None], tees[:, 1:])
         else:
@@ -214,6 +215,8 @@ def fit_crossing(
             break
         if step == 0 and quick and others is not None and not any(explains(f, PROMISING, 0.0) for f in told()):
             break
+        if step > WEIGHED and not edge:
+            left.append(float(gram[-1, -1] - theta @ gram[at, -1]))
         delta = step_of(gram, theta, tees.shape[1] - 1, 1e-3 if step < 4 else 1e-6).reshape(len(now), -1)
         if edge and step in _LOOKED_AGAIN:
             deep = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta, strict=False)]

@@ -12,6 +12,7 @@ from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.find import CHANCE
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution
+from rsa_vision.detect.film.progress import WEIGHED, in_vain
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float
@@ -22,9 +23,6 @@ _DEEPER = 2.0  # times the height of an image: a depth beyond that is what thin 
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less
 _CLOSE_PX = 0.1
 _SPARE_PX = 4.0  # beyond which a start's surroundings are not looked at
-_WEIGHED = 3  # step after which weights no longer change
-# times the noise, more than which pins of the film seldom leave; of that, what a step is to gain; steps that gain less
-_UNLIKE, _GAINED, _MOST_IN_VAIN = 4.0, 0.02, 3
 _GROWS, _WORTH = 3, 0.8  # times that a fit which has grown out of these begins again, and what it must explain of what it saw
 _MOVES = 5  # tip, half width, length, direction
 _UNDER = 0.08  # of the height of an image, from which a pixel lies under it
@@ -110,9 +108,9 @@ def _fitted(
     weight = np.full(len(data), 1.0 / float(noise.variance_at(np.array([data.mean()]))[0]))
     converged, free = False, [1, 2, 5] if sized else [1, 2, 3, 4, 5]
     steps, close, far = (6, _CLOSE_PX, 3.0) if quick else (_STEPS, _CONVERGED_PX, 1.5)
-    least, in_vain = np.inf, 0
+    left: list[float] = []
     for step in range(steps + 1):
-        last = step == steps or converged or in_vain == _MOST_IN_VAIN  # nobody asks where to go next
+        last = step == steps or converged or in_vain(left, len(data))  # nobody asks where to go next
         images = arm_images(cols - tip[0], rows - tip[1], angles, shape, optics, slopes=not last).sum(1)
         moves, linear = images[[] if last else free], np.concatenate([images[:1], surface])
         weighted = np.concatenate([moves, linear, data[None]]) * np.sqrt(weight)
@@ -120,14 +118,12 @@ def _fitted(
         theta = damped_solution(gram[len(moves) : -1, len(moves) : -1], gram[len(moves) : -1, -1], 1e-9)
         if last:
             break
-        left = float(gram[-1, -1] - theta @ gram[len(moves) : -1, -1])
-        if step > _WEIGHED:
-            in_vain = in_vain + 1 if left > max(_UNLIKE * len(data), (1 - _GAINED) * least) else 0
-            least = min(least, left)
+        if step > WEIGHED:
+            left.append(float(gram[-1, -1] - theta @ gram[len(moves) : -1, -1]))
         delta = np.zeros(1 + _MOVES)
         delta[free] = step_of(gram, theta, len(moves), 1e-4 if step < 4 else 1e-7)
         delta = delta[1:]
-        if step in (0, _WEIGHED):
+        if step in (0, WEIGHED):
             weight = 1.0 / noise.variance_at(theta @ linear)
         scale = min(1.0, far / max(np.abs(delta[:2]).max(), 1e-9), 0.15 / max(abs(delta[4]), 1e-9))
         tip += scale * delta[:2]

@@ -13,6 +13,7 @@ from rsa_vision.detect.balls.fits import BallFits, radii, uneven, uneven_white
 from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import columns, damped_solution, weighted_least_squares
+from rsa_vision.detect.film.progress import WEIGHED, in_vain
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.group_images import GroupImages, GroupWindow, images_in, window_around
@@ -23,6 +24,7 @@ _CONVERGED_PX = 1e-3
 _MOST_PX, _LAST_PX = 0.5, 1.0  # of a step; of the last one, which is not held near: from farther off no straight line leads there
 _MOST_RADII = 0.12  # of a step, of large balls
 _ARRIVED = 12  # steps after which what still takes the longest ones is lost
+_STILL_PX = 0.05  # what hardly goes any farther where steps are in vain is there
 _LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
 
 
@@ -98,14 +100,18 @@ def fit_group(
         seen = draw(local, radius)
         theta = weighted_least_squares(seen.linear, weight, data, 1e-6)
     converged, lost, before = False, np.zeros(k, bool), np.zeros((3, k))
+    left, ends = list[float](), False
     most = max(_MOST_PX, _MOST_RADII * float(radius.min()))
     for step in range(steps + 1):
         value, linear, jac = seen.value, seen.linear, seen.jacobian(theta)
         residual = data - linear @ theta
-        if step == steps or converged or lost.any():
+        if step == steps or converged or ends:
             break
         if step in (4, 10):
             weight = valid / noise.variance_at(linear @ theta + window.neighbours)
+        if step > WEIGHED and k > 1 and not edge:  # what is compared with a fit beside an edge is to get there
+            left.append(float(weight @ residual**2))
+        vain = in_vain(left, float(valid.sum()))
         delta = weighted_least_squares(jac, weight, residual, 1e-3 if step < 6 else 1e-7)
         move = delta[: 3 * k].reshape(3, k)
         farthest = float(np.abs(move).max())
@@ -115,7 +121,9 @@ def fit_group(
         before = move
         local = local + scale * move[:2].T
         radius = np.clip(radius + scale * move[2], low, high)
-        converged, lost = step > 2 and farthest < _CONVERGED_PX, (np.abs(move).max(axis=0) > most) & (step >= _ARRIVED)
+        converged = step > 2 and farthest < (_STILL_PX if vain else _CONVERGED_PX)
+        lost = (np.abs(move).max(axis=0) > most) & (vain or step >= _ARRIVED)
+        ends = vain or bool(lost.any())
         if edge:
             if taken:
                 ground = _under(seen.value, surface @ theta[k : k + surface.shape[1]])
