@@ -38,8 +38,16 @@ def test_one_that_a_corner_pulls_is_unlike_those_of_its_kind() -> None:
     assert abs(differ_px(pulled, clear)[4] - 0.25) < 0.01
 
 
+def test_few_clear_balls_tell_a_size_as_closely_as_magnification_lets_it_be_known() -> None:
+    """Two of 1 mm without a clear one were stated 0.8 and 1 px off, for 0.03 and 0.05."""
+    clear = of_radii(2.26, 3.47, 3.56, 3.61, 4.36)
+    differ = differ_px(of_radii(4.25, 4.45, 4.8, 5.39, 5.55), clear)
+    assert (differ[[0, 1, 3, 4]] == 0).all()
+    assert abs(differ[2] - (0.44 - 0.04 * 4.8)) < 0.01
+
+
 def test_one_of_a_size_of_its_own_is_unlike_all() -> None:
-    assert abs(differ_px(of_radii(2.9, 2.95, 3.0, 3.05, 4.5), of_radii(1.8, 1.85, 1.9))[4] - 1.4) < 0.1
+    assert abs(differ_px(of_radii(2.9, 2.95, 3.0, 3.05, 4.5), of_radii(1.8, 1.85, 1.9))[4] - (1.45 - 0.04 * 4.5)) < 0.01
 
 
 def test_where_hardly_any_ball_is_clear_nothing_is_said() -> None:

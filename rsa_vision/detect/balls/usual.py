@@ -22,7 +22,7 @@ _FEW = 0.25  # clear balls to one that is fitted with an edge, from which they d
 _APART = 1.15  # ratio of radii of two kinds
 _LEAST_SIZES = 3  # balls that tell which sizes there are
 _COMPANY = 5  # others of its size: nothing beside a ball makes it by chance
-_MAGNIFIED, _FEW_OTHERS = 0.04, 3  # parts by which radii of markers differ that are nearer to the film; so many others have such a size
+_MAGNIFIED = 0.04  # parts by which radii of markers of one size differ that are nearer to the film or farther from it
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +104,9 @@ def size_unlike(balls: BallFits, clear: BallFits) -> Float:
 
     What pulls at a radius, as a corner or a second edge beside a ball does, pulls at its centre as much. Where clear balls are few, as
     those in nearly saturated film beside a limb full of structure, what most of the others are like is usual as well; and so is a size that
-    several others share, as balls that a focal spot draws do, and about the size where no clear ones tell it: where film was sharpened, all
-    larger balls have an edge around them.
+    several others share, as balls that a focal spot draws do. Fewer than three clear ones of about a size tell it only as closely as
+    magnification lets it be known; where there is none, another beside an edge does, for no two are pulled to one size. Where film was
+    sharpened, all larger balls have an edge around them.
     """
     if len(clear.depth) < _LEAST_SIZES:
         return np.zeros(len(balls.depth))
@@ -114,12 +115,12 @@ def size_unlike(balls: BallFits, clear: BallFits) -> Float:
         gap = np.maximum(np.abs(balls.radius_px[:, None] - others.radius_px) - about * balls.radius_px[:, None], 0.0)
         return np.sort(np.maximum(gap**2 - balls.covariance[:, None, 2, 2] - others.covariance[:, 2, 2], 0.0), axis=1)
 
-    more = apart(clear)[:, 0]
+    kin = (np.abs(np.log(balls.radius_px[:, None] / clear.radius_px)) < np.log(_APART)).sum(axis=1)
+    more = np.where(kin < _LEAST_SIZES, apart(clear, _MAGNIFIED)[:, 0], apart(clear)[:, 0])
+    if len(balls.depth) > 1:
+        more = np.where(kin == 0, np.minimum(more, apart(balls, _MAGNIFIED)[:, 1]), more)
     if len(balls.depth) > _COMPANY:  # no edges pull so many by the same
         more = np.minimum(more, apart(balls)[:, _COMPANY])
-    if len(balls.depth) > _FEW_OTHERS:
-        told = (np.abs(np.log(balls.radius_px[:, None] / clear.radius_px)) < np.log(_APART)).sum(axis=1) >= _LEAST_SIZES
-        more = np.where(told, more, np.minimum(more, apart(balls, _MAGNIFIED)[:, _FEW_OTHERS]))
     if len(clear.depth) < _FEW * len(balls.depth):
         gap = np.square(balls.radius_px - np.median(balls.radius_px))
         more = np.minimum(more, np.maximum(gap - balls.covariance[:, 2, 2], 0.0))
