@@ -27,7 +27,6 @@ CASES: dict[str, tuple[str, dict[str, Any], list[str], float]] = {
     "2, linear, 12 bit, DICOM": ("2", {"response": "linear", "bits": 12, "extension": "dcm"}, [], OTHERS_UM),
     "1B, log, inverted": ("1B", {"response": "log", "inverted": True}, [], OTHERS_UM),
     "1A, mirrored": ("1A", {"mirrored": True}, ["--orientation", "mirrored"], 1.0),
-    "1B, turned": ("1B", {"rotation_deg": 30.0}, [], 1.0),
     "1B, bone": ("1B", {"bone": True, "scatter": 0.2}, [], 1.0),
     "2, turned and stretched": ("2", {"rotation_deg": -20.0, "anisotropy": 0.01, "shear": 0.003}, [], 1.0),
 }

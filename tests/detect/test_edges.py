@@ -84,7 +84,7 @@ def among_corners(balls: Float, at_corner: Bool, rng: np.random.Generator) -> ND
     return film_of(path, balls, rng, noise_blur_px=0.8)
 
 
-@pytest.mark.parametrize(("soft_px", "deep"), [(3.0, 0.2), (4.0, 0.3), (5.0, 0.3)])
+@pytest.mark.parametrize(("soft_px", "deep"), [(3.0, 0.2), (5.0, 0.3)])
 def test_balls_on_soft_edges_are_as_far_off_as_stated(soft_px: float, deep: float) -> None:
     """Where islands of a random field begin; the errors of clear balls were up to 2.5 times what was stated of them."""
     square = []

@@ -72,7 +72,7 @@ def test_noise_under_a_few_small_faint_balls_is_no_reason_to_lose_them(radius_px
 def test_a_few_large_soft_balls_in_the_noise_of_quanta(log: bool, radius_px: float, cnr: float, n: int) -> None:
     """Where little comes through there is less noise on a linear film, and more on one of the logarithm of the exposure."""
     z2: list[float] = []
-    for seed in range(4):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         places = np.array([[60.0, 60.0], [190.0, 70.0], [70.0, 190.0], [200.0, 200.0], [130.0, 130.0]])
         truth = rng.permutation(places + rng.uniform(-10, 10, places.shape))[:n]
@@ -87,8 +87,8 @@ def test_a_few_large_soft_balls_in_the_noise_of_quanta(log: bool, radius_px: flo
         error, covariance = images.position_px[index] - truth[near], images.covariance_px2[index]
         z2 += np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).tolist()
     ratio = float(np.sqrt(np.mean(z2) / 2))
-    print(f"log {log}, radius {radius_px}, CNR {cnr}: {len(z2)} of {4 * n}, error / sd {ratio:.2f}")
-    assert len(z2) >= (4 * n if n > 1 or not log else 1)  # one ball alone tells its noise badly
+    print(f"log {log}, radius {radius_px}, CNR {cnr}: {len(z2)} of {3 * n}, error / sd {ratio:.2f}")
+    assert len(z2) >= (3 * n if n > 1 or not log else 1)  # one ball alone tells its noise badly
     assert ratio < 1.6 + 0.4 * (n == 1)
 
 

@@ -16,7 +16,6 @@ BAND = (0.4, 1.4)  # observed / stated error of 60 to 130 coordinates; where the
     [
         ("2", {}),
         ("2", {"response": "log", "bits": 8}),
-        ("2", {"response": "transmission"}),
         ("1B", {}),
         ("1A", {"response": "linear", "noise": "white"}),
     ],

