@@ -23,6 +23,6 @@ def in_vain(left: Sequence[float], by_noise: float) -> bool:
     -------
     bool
     """
-    if len(left) <= _MOST or left[-1] < _UNLIKE * by_noise:
-        return False
-    return all(left[i] > max(_UNLIKE * by_noise, (1 - _GAINED) * min(left[:i])) for i in range(len(left) - _MOST, len(left)))
+    return len(left) > _MOST and all(
+        left[i] > max(_UNLIKE * by_noise, (1 - _GAINED) * min(left[:i])) for i in range(len(left) - _MOST, len(left))
+    )
