@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.types import Float, MarkerImages
 
 FINE = 5  # samples of a pixel along either axis
@@ -82,6 +84,13 @@ def strip(
     inside = ((u > 0) & (u < length) & (np.abs(v) < width_px / 2)).reshape(high[1] - low[1], FINE, high[0] - low[0], FINE)
     out[low[1] : high[1], low[0] : high[0]] = gaussian_filter(inside.mean(axis=(1, 3)), sigma_px, mode="nearest")
     return out
+
+
+def ball_fits(position_px: Float, radius_px: float | Float, **known: Float) -> BallFits:
+    """Return fits of balls of which no more is known, zero otherwise."""
+    n = len(position_px)
+    nothing = {field.name: np.zeros(n) for field in fields(BallFits)} | {"covariance": np.zeros((n, 4, 4))}
+    return BallFits(**{**nothing, "position_px": position_px, "radius_px": np.broadcast_to(radius_px, n), **known})
 
 
 def misses(found: MarkerImages, balls: Float) -> tuple[Float, Float]:

@@ -14,6 +14,7 @@ from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin
 
+from .films import ball_fits
 from .test_covered import CELLS, FINE, MU_PER_MM, PITCH_MM, SIDE, exposed, tips_of
 from .test_laid_on import RADIUS_PX, light_past_balls
 
@@ -61,10 +62,7 @@ def test_pins_with_balls(nearest: float) -> None:
 
 
 def ball_at(col: float, row: float, depth: float = -1000.0) -> BallFits:
-    one, none = np.ones(1), np.zeros(1)
-    return BallFits(
-        np.array([[col, row]]), 4 * one, depth * one, np.zeros((1, 4, 4)), *[none] * 6, one, *[none] * 3, one > 0, np.zeros(1, np.int64)
-    )
+    return ball_fits(np.array([[col, row]]), 4.0, depth=np.array([depth]))
 
 
 def test_what_lies_over_a_pin() -> None:

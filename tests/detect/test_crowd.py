@@ -9,10 +9,9 @@ from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.balls.crowd import lost_in_a_crowd
-from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.search.candidates import Candidates
 
-from .films import stored
+from .films import ball_fits, stored
 
 
 def trabeculae(rng: np.random.Generator) -> NDArray[np.uint16]:
@@ -45,8 +44,7 @@ def test_faint_marks_are_lost_among_texture_only() -> None:
     places = rng.uniform(2000, 3000, (400, 2))
     balls = np.stack([np.full(count, 500.0), 100.0 * np.arange(count)], axis=1)
     own, explained = np.array([20.0, 6.5, 6.5, 5.0, 5.0]), np.array([0.9, 0.9, 0.97, 0.9, 0.99])
-    none = np.zeros((count, 4, 4))
-    fits = BallFits(balls, np.full(count, 4.0), own, none, *[own] * 3, explained, *[own] * 6, own > 0, np.zeros(count, np.int64))
+    fits = ball_fits(balls, 4.0, depth=own, explained=explained, significance=own)
     for texture, lost in (
         (rng.uniform(5.6, 9.0, 400), [1, 3]),
         (rng.uniform(4.0, 5.4, 400), []),

@@ -8,16 +8,12 @@ import pytest
 from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.marks.resolve import doubt_of_number
 
+from .films import ball_fits
+
 
 def balls(cols: list[float], significance: list[float]) -> BallFits:
     """Return balls of radius 4 px in a row."""
-    n = len(cols)
-    ones = np.ones(n)
-    position = np.column_stack([cols, np.zeros(n)])
-    fits = [position, 4 * ones, -1000 * ones, np.tile(0.01 * np.eye(4), (n, 1, 1)), *[ones] * 10, ones > 0, np.zeros(n, np.int64)]
-    names = [name for name in BallFits.__slots__ if not name.startswith("_")]
-    known = dict(zip(names, fits, strict=True))
-    return BallFits(**{**known, "significance": np.array(significance)})
+    return ball_fits(np.column_stack([cols, np.zeros(len(cols))]), 4.0, significance=np.array(significance))
 
 
 @pytest.mark.parametrize(

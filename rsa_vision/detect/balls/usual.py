@@ -111,14 +111,15 @@ def size_unlike(balls: BallFits, clear: BallFits) -> Float:
     if len(clear.depth) < _LEAST_SIZES:
         return np.zeros(len(balls.depth))
 
-    def apart(others: BallFits, about: float = 0.0) -> Float:
-        gap = np.maximum(np.abs(balls.radius_px[:, None] - others.radius_px) - about * balls.radius_px[:, None], 0.0)
+    def apart(others: BallFits, about_px: Float | float = 0.0) -> Float:
+        gap = np.maximum(np.abs(balls.radius_px[:, None] - others.radius_px) - np.reshape(about_px, (-1, 1)), 0.0)
         return np.sort(np.maximum(gap**2 - balls.covariance[:, None, 2, 2] - others.covariance[:, 2, 2], 0.0), axis=1)
 
     kin = (np.abs(np.log(balls.radius_px[:, None] / clear.radius_px)) < np.log(_APART)).sum(axis=1)
-    more = np.where(kin < _LEAST_SIZES, apart(clear, _MAGNIFIED)[:, 0], apart(clear)[:, 0])
+    about_px = np.where(kin < _LEAST_SIZES, _MAGNIFIED * balls.radius_px, 0.0)
+    more = apart(clear, about_px)[:, 0]
     if len(balls.depth) > 1:
-        more = np.where(kin == 0, np.minimum(more, apart(balls, _MAGNIFIED)[:, 1]), more)
+        more = np.where(kin == 0, np.minimum(more, apart(balls, about_px)[:, 1]), more)
     if len(balls.depth) > _COMPANY:  # no edges pull so many by the same
         more = np.minimum(more, apart(balls)[:, _COMPANY])
     if len(clear.depth) < _FEW * len(balls.depth):
