@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rsa_vision.detect import detect_markers
+from rsa_vision.detect.neighbours.rims import cut_from_outlines
 from rsa_vision.types import Float
 
 from .films import film_of_balls, grid_of_balls, stored, strip
@@ -57,3 +58,12 @@ def test_balls_over_wires_stay(shape: str) -> None:
     assert gap.min() < 1.0
     sd = float(np.sqrt(np.linalg.eigvalsh(found.covariance_px2[gap.argmin()])[-1]))
     assert gap.min() < 3 * sd
+
+
+def test_where_nothing_stands_alone_and_some_go_on_all_are_pieces_of_outlines() -> None:
+    touching, ends = np.ones(6, bool), np.array([True, True, False, False, False, False])
+    assert cut_from_outlines(touching, ends).all()
+    assert not cut_from_outlines(touching, np.zeros(6, bool)).any()  # crowds
+    touching[5] = False
+    assert not cut_from_outlines(touching, ends).any()
+    assert cut_from_outlines(np.zeros(0, bool), np.zeros(0, bool)).shape == (0,)

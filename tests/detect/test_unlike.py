@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.balls.unlike import of_odd_size, too_deep, too_pale
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
-from rsa_vision.detect.needles.arms import lone_tees
+from rsa_vision.detect.needles.arms import badly_placed, lone_tees
 from rsa_vision.detect.needles.fits import unfit
 from rsa_vision.flags import MarkerFlag
 
@@ -152,3 +152,9 @@ def test_tees_among_balls_need_company() -> None:
     assert lone_tees([*two, tee(1.5, 2.5)], np.ones(3, bool)).all()
     assert lone_tees([*two, tee(0.0, 4.5)], np.ones(3, bool)).all()
     assert lone_tees(three, np.array([True, True, False])).tolist() == [True, True, False]
+
+
+def test_a_tee_whose_place_is_known_badly_though_it_stands_high_above_noise_is_none() -> None:
+    covariance = np.array([0.02, 0.02, 0.3, 0.3, np.nan])[:, None, None] ** 2 * np.eye(2)
+    snr = np.array([200.0, 20.0, 20.0, 200.0, 200.0])
+    assert badly_placed(covariance, np.full(5, 2.0), snr).tolist() == [False, False, False, True, False]

@@ -40,8 +40,8 @@ from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, groups_of, images
 from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.neighbours.laid_on import fit_over, look_on_arms, over_arms
 from rsa_vision.detect.neighbours.oblong import are_oblong
-from rsa_vision.detect.neighbours.rims import goes_on
-from rsa_vision.detect.neighbours.rows import in_rows
+from rsa_vision.detect.neighbours.rims import cut_from_outlines, goes_on
+from rsa_vision.detect.neighbours.rows import in_rows, like_those_in_rows
 from rsa_vision.detect.neighbours.under_curve import under_curve
 from rsa_vision.detect.search.candidates import STRENGTH, Candidates
 from rsa_vision.types import Bool, Float, Int, MarkerImages
@@ -318,7 +318,8 @@ def _measured(
     balls, ratio, touching, poor, rowed = balls.rows(keep), ratio[keep], touching[keep], poor[keep], around.rowed[keep]
     added = added[np.append(keep, np.ones(len(others), bool))]
     poor = rowed | np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
-    doubtful = rowed | lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
+    doubtful = rowed | like_those_in_rows(balls.position_px, balls.radius_px, balls.depth, rowed) | cut_from_outlines(touching, ends[keep])
+    doubtful |= lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
     # a pin has one arm: what hides a part of it is felt at its tip
     touching = np.concatenate([touching, np.zeros(len(needles.tees), bool), lapped(needles.pins, balls, optics)])
     return table_of(film, bits, balls, under, ratio, added, touching, poor, doubtful, others, faint.junctions, optics, noise)

@@ -18,7 +18,7 @@ from rsa_vision.detect.marks.resolve import doubt_of_number
 from rsa_vision.detect.marks.settle import STRUCTURE
 from rsa_vision.detect.models.needles import NeedleFit, wrapped
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.arms import lone_tees, meet_others, perhaps_arms
+from rsa_vision.detect.needles.arms import badly_placed, lone_tees, meet_others, perhaps_arms
 from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, excess_of, significant_misfit
 from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.flags import MarkerFlag
@@ -124,6 +124,8 @@ def table_of(
     arms = np.array([len(t.angles) for t in needles])
     for kind in (np.flatnonzero(arms == count) + n for count in (1, 3)):
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), NEEDLES_ALIKE)
+    snr = depth / np.sqrt(noise.variance_at(background))
+    flags[n:][(arms == 3) & badly_placed(covariance[n:], radius[n:], snr[n:])] |= MarkerFlag.UNLIKE
     flags[n:][perhaps_arms(needles, junctions) | meet_others(film, needles) | (radius[n:] <= _LINE_PX)] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in needles]) > DOUBTFUL * MISFIT])
     if n >= COMPANY:  # among balls a pin or two are more likely ends of rods, and a tee or two are letters of lead
@@ -149,7 +151,6 @@ def table_of(
     flags[np.append(np.flatnonzero(pale | doubtful), odd)] |= MarkerFlag.UNLIKE
     angle = np.concatenate([np.full(n, np.nan), [np.rad2deg(wrapped(t.angles[0])) for t in needles]])
     shape = np.array(["ball"] * n + [{1: "pin", 3: "tee"}[len(t.angles)] for t in needles], dtype="U4")
-    snr = depth / np.sqrt(noise.variance_at(background))
     table = MarkerImages(position, covariance, shape, radius, angle, depth / full, background / full, snr, flags)
     # of what is small against the blur hardly any of its depth is seen; texture has specks as high as marks, and more that are none
     over_structure = height_of(balls, optics.sigma_px) / np.sqrt(np.clip(balls.chi2_ring, 1.0, EDGE))

@@ -16,6 +16,7 @@ _FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these
 _AT_TIP = 0.35  # of a pin's length, from its tip to where three arms meet
 _AWAY = np.array([0.35, 0.5, 0.65])  # of a pin's length from its tip, where another is sought
 _AS_WIDE = 0.35  # logarithms of the half widths of the tees of a set, which stand for depth
+_WORSE, _BADLY = 4.0, 0.1  # times its half width over what a tee stands above noise; parts of that width
 _WAYS, _BESIDE, _OWN = 72, 6, 9  # directions; steps of these to what lies beside an arm, and within which all is the pin itself
 _AS_HIGH = 0.5  # of the pin's own height there
 
@@ -89,3 +90,26 @@ def lone_tees(needles: list[NeedleFit], sure: Bool) -> Bool:
     alike = parallel & (np.abs(width[:, None] - width) < _AS_WIDE) & tee & sure
     alike[np.diag_indices(len(tee))] = True
     return np.asarray(tee & (alike.sum(axis=1) < LEAST_OF_A_KIND))
+
+
+def badly_placed(covariance_px2: Float, half_width_px: Float, snr: Float) -> Bool:
+    """Say of which tees the place is known badly, and far worse than noise lets it be: something else that has three arms.
+
+    The edges of its arms tell where a tip is to about their half width over what they stand above noise.
+
+    Parameters
+    ----------
+    covariance_px2 : ndarray of shape (n, 2, 2)
+    half_width_px : ndarray of shape (n,)
+    snr : ndarray of shape (n,)
+        What the arms stand above noise, in its standard deviations in a pixel.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        Not those of which no place is known at all.
+    """
+    known = np.asarray(np.isfinite(covariance_px2).all(axis=(1, 2)))
+    sd_px = np.zeros(len(covariance_px2))
+    sd_px[known] = np.sqrt(np.linalg.eigvalsh(covariance_px2[known])[:, -1])
+    return np.asarray(sd_px > half_width_px * np.maximum(_WORSE / snr, _BADLY))

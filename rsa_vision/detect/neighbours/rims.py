@@ -18,6 +18,7 @@ AS_HIGH: Final = 0.8  # of the height: a ball over the strongest thing that it s
 HALF: Final = 0.5
 MOST_OF_A_RIM: Final = 0.4  # what takes up more on one side is the edge of something that a ball may lie on
 _DIRECTIONS = 2 * np.pi * np.arange(24) / 24
+_OF_OUTLINES: Final = 0.25  # of all balls of a film
 _WITHIN: Final = 0.5  # of the radius: the middle
 
 
@@ -57,6 +58,23 @@ def goes_on(film: NDArray[Any], balls: BallFits, number: Int, beside: Beside, si
         opposite = np.minimum(height, np.roll(height, len(_DIRECTIONS) // 2))
         out[i] = (narrow and height.max() > AS_HIGH) or opposite.max() > AS_HIGH
     return out
+
+
+def cut_from_outlines(touching: Bool, ends: Bool) -> Bool:
+    """Say of all balls of a film, where none stands alone and many go on beyond their rims, that they are pieces of outlines.
+
+    Parameters
+    ----------
+    touching : ndarray of bool, shape (n,)
+        With others, or with anything as high as itself, beside it.
+    ends : ndarray of bool, shape (n,)
+        As of :func:`goes_on`.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    return np.full(len(ends), len(ends) > 0 and bool(touching.all()) and bool(ends.mean() > _OF_OUTLINES))
 
 
 def sample(film: NDArray[Any], cols: Float, rows: Float) -> Float:

@@ -9,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.types import Bool, Float, Int
 
 _ROW = 5  # at least so many in line, one as far from the next as all others
@@ -20,6 +21,8 @@ _IN_STEP = 0.2  # steps, by which those differ from whole numbers along it, and 
 _NEXT_TO = 0.6  # steps along it, within which others stand beside one
 # steps across, of lines next to it; a screw has its core there, and one line on that
 _LINES = ((-2.5, -1.5), (-1.5, -0.6), (0.6, 1.5), (1.5, 2.5))
+_SCREW, _KIN = 12.0, 3  # diameters from others of a row, and how many of these have its size and depth
+_SAME_DEPTH, _SAME_SIZE = 1.25, 1.2  # ratios of what one thread leaves here and there
 _FELLOWS, _GAP = 2, 4.5  # others of their line, and how many steps they may be away: not every crest is seen
 
 
@@ -61,6 +64,38 @@ def in_rows(position_px: Float, radius_px: Float, depth: Float) -> Bool:
             out[members] = True
             out |= _of_one_screw(by_step, radius_px, depth, members)
     return out
+
+
+def like_those_in_rows(position_px: Float, radius_px: Float, depth: Float, rowed: Bool) -> Bool:
+    """Say which balls near rows have the size and the depth of several of those in rows, and not of one other ball of the film.
+
+    Of a screw that shows many crests some are seen out of step, or too few beside each other.
+
+    Parameters
+    ----------
+    position_px : ndarray of shape (n, 2)
+    radius_px : ndarray of shape (n,)
+    depth : ndarray of shape (n,)
+        In film values.
+    rowed : ndarray of bool, shape (n,)
+        As of :func:`in_rows`.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None of those in rows.
+    """
+    out = np.zeros(len(depth), bool)
+    if np.count_nonzero(rowed) < _KIN:
+        return out
+    like = _alike(radius_px[:, None], radius_px, _SAME_SIZE) & _alike(depth[:, None], depth, _SAME_DEPTH)
+    near = gaps(position_px, position_px) < 2 * _SCREW * radius_px[:, None]
+    perhaps = ~rowed & (like[:, rowed].sum(axis=1) >= _KIN)
+    while True:  # from one to the next along the screw
+        more = perhaps & ~out & near[:, rowed | out].any(axis=1)
+        if not more.any():
+            return np.asarray(out & ~like[:, ~rowed & ~out].any(axis=1))
+        out |= more
 
 
 def _steps(position_px: Float, radius_px: Float, depth: Float) -> tuple[Int, Int]:
