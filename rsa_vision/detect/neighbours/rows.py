@@ -85,17 +85,23 @@ def like_those_in_rows(position_px: Float, radius_px: Float, depth: Float, rowed
     ndarray of bool, shape (n,)
         None of those in rows.
     """
+
+    def like(which: Bool | Int, others: Bool) -> Bool:
+        size = _alike(radius_px[which, None], radius_px[others], _SAME_SIZE)
+        return size & _alike(depth[which, None], depth[others], _SAME_DEPTH)
+
     out = np.zeros(len(depth), bool)
-    if np.count_nonzero(rowed) < _KIN:
-        return out
-    like = _alike(radius_px[:, None], radius_px, _SAME_SIZE) & _alike(depth[:, None], depth, _SAME_DEPTH)
-    near = gaps(position_px, position_px) < 2 * _SCREW * radius_px[:, None]
-    perhaps = ~rowed & (like[:, rowed].sum(axis=1) >= _KIN)
-    while True:  # from one to the next along the screw
-        more = perhaps & ~out & near[:, rowed | out].any(axis=1)
-        if not more.any():
-            return np.asarray(out & ~like[:, ~rowed & ~out].any(axis=1))
-        out |= more
+    perhaps = np.flatnonzero(~rowed)
+    perhaps = perhaps[like(perhaps, rowed).sum(axis=1) >= _KIN]
+    reach_px = 2 * _SCREW * radius_px[perhaps, None]
+    found = (gaps(position_px[perhaps], position_px[rowed]) < reach_px).any(axis=1)
+    near = gaps(position_px[perhaps], position_px[perhaps]) < reach_px
+    while (more := ~found & near[:, found].any(axis=1)).any():  # from one to the next along the screw
+        found |= more
+    of_screw = rowed.copy()
+    of_screw[perhaps[found]] = True
+    out[perhaps[found]] = ~like(perhaps[found], ~of_screw).any(axis=1)
+    return out
 
 
 def _steps(position_px: Float, radius_px: Float, depth: Float) -> tuple[Int, Int]:
