@@ -1,4 +1,4 @@
-"""Pins that may be what was seen of a tee, by tees beside them, by what else meets at their tips; and tees that may be letters."""
+"""Pins that may be what was seen of a tee, by tees beside them or what meets at their tips; tees that may be letters or edges of plates."""
 
 from __future__ import annotations
 

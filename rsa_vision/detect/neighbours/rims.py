@@ -18,8 +18,8 @@ AS_HIGH: Final = 0.8  # of the height: a ball over the strongest thing that it s
 HALF: Final = 0.5
 MOST_OF_A_RIM: Final = 0.4  # what takes up more on one side is the edge of something that a ball may lie on
 _DIRECTIONS = 2 * np.pi * np.arange(24) / 24
-_OF_OUTLINES: Final = 0.25  # of all balls of a film
 _WITHIN: Final = 0.5  # of the radius: the middle
+_OF_OUTLINES: Final = 0.25  # of all balls of a film
 
 
 def goes_on(film: NDArray[Any], balls: BallFits, number: Int, beside: Beside, sigma_px: float) -> Bool:

@@ -21,9 +21,9 @@ _IN_STEP = 0.2  # steps, by which those differ from whole numbers along it, and 
 _NEXT_TO = 0.6  # steps along it, within which others stand beside one
 # steps across, of lines next to it; a screw has its core there, and one line on that
 _LINES = ((-2.5, -1.5), (-1.5, -0.6), (0.6, 1.5), (1.5, 2.5))
+_FELLOWS, _GAP = 2, 4.5  # others of their line, and how many steps they may be away: not every crest is seen
 _SCREW, _KIN = 12.0, 3  # diameters from others of a row, and how many of these have its size and depth
 _SAME_DEPTH, _SAME_SIZE = 1.25, 1.2  # ratios of what one thread leaves here and there
-_FELLOWS, _GAP = 2, 4.5  # others of their line, and how many steps they may be away: not every crest is seen
 
 
 def in_rows(position_px: Float, radius_px: Float, depth: Float) -> Bool:
