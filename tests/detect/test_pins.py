@@ -26,7 +26,7 @@ DENSE = 0.45  # exposure of half the largest density
 def film_of_pins(
     rng: np.random.Generator,
     *,
-    taper: float | None = None,
+    taper: float | tuple[float, ...] | None = None,
     base: Float | float = 0.6,
     bright: bool = False,
     slope: float = 0.0,
@@ -42,6 +42,7 @@ def film_of_pins(
     """Pins of 0.5 x 2 mm in all directions, exact chords; tips and directions away from them, both (n, 2), (col, row).
 
     There are ``cells`` a side. Every third is ``smaller`` by that factor; they are up to ``longer`` times as long as their widths have it.
+    ``taper``: length of the points, in mm, one after the other if there are several.
     ``response``: ``density``, of film with half as much scattered light. ``tail``: part of the
     light that is spread four times as far. ``unevenly``: so many times as far along columns as along rows.
     ``penumbra_px``: blur that every second pin has besides.
@@ -60,7 +61,8 @@ def film_of_pins(
         lean = slope * rng.uniform(-1, 1, 2) if slope else np.zeros(2)  # of the rays, along columns and rows
         origin, down = np.array([x * PITCH_MM, y * PITCH_MM, 0 * x]), np.array([0 * x + lean[0], 0 * x + lean[1], 0 * x + 1])
         length = 2.0 * size * (rng.uniform(1 / longer, longer) if longer > 1 else 1.0)
-        chord = chord_pin(origin, down, np.zeros(3), np.array([*way, 0.0]), length, 0.25 * size, taper)
+        point = taper[len(tips) % len(taper)] if isinstance(taper, tuple) else taper
+        chord = chord_pin(origin, down, np.zeros(3), np.array([*way, 0.0]), length, 0.25 * size, point)
         left = np.exp(-MU_PER_MM * chord).reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
         clear[len(tips) % 2, corner[1] : corner[1] + 2 * half + 1, corner[0] : corner[0] + 2 * half + 1] *= left
         tips.append(tip)
@@ -325,6 +327,22 @@ def test_pins_with_tapers_of_their_own_are_where_they_are_said_to_be(quanta: flo
         squares += np.einsum("ni,ni->n", errors, np.linalg.solve(pins.covariance_px2, errors[:, :, None])[:, :, 0]).tolist()
     assert max(squares) < 20
     assert 0.7 < np.sqrt(np.mean(squares) / 2) < 1.6  # all pins of a film share some of it
+
+
+@pytest.mark.parametrize(("taper", "longer"), [((0.5, 0.8, 1.2, 1.6), 1.3), (0.7, 1.5)])
+def test_pins_of_a_film_need_not_be_of_one_form(taper: float | tuple[float, ...], longer: float) -> None:
+    """Those of another taper than most were dropped; and all where they were of too many lengths to be of a kind."""
+    film, tips, _ = film_of_pins(np.random.default_rng(3), taper=taper, longer=longer, quanta=QUANTA / 4)
+    images = detect_markers(film, bits=16).images
+    pins = images.rows(images.shape == "pin")
+    off = pins.position_px - tips[:, None]
+    nearest = np.hypot(*off.transpose(2, 0, 1)).argmin(axis=1)
+    error, covariance = off[np.arange(len(tips)), nearest], pins.covariance_px2[nearest]
+    found = np.hypot(*error.T) < 4
+    print(f"{found.sum()} of {len(tips)}, {len(pins)} pins")
+    assert found.sum() >= 0.8 * len(tips)
+    assert len(pins) == found.sum()
+    assert np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])[found].max() < 20
 
 
 def test_one_speck_does_not_tell_the_blur_of_a_film_of_pins() -> None:

@@ -39,6 +39,7 @@ _ODD = 6.0  # half the chi2 by which chance makes a pin of the known size worse 
 _PALE = 0.5  # of the typical depth
 # logarithms of half width and length: how far first looks of one kind differ, and pins of one; part of a film's pins that are of one
 _ROUGHLY_ALIKE, _ALIKE, _MOST = 0.35, 0.12, 0.6
+_AS_THICK = 0.2  # logarithm of half width: of pins aslant, that look shorter the more they are so
 _AT_ALL_ALIKE = float(np.log(2.0))  # the same of pins in much noise
 _TELL, _SAME_LENGTH = 6, 0.05  # pins of a film that tell what is odd; logarithm of the lengths of one kind
 
@@ -177,6 +178,15 @@ def are_alike(pins: list[NeedleFit]) -> bool:
 def are_of_a_kind(pins: list[NeedleFit]) -> bool:
     """Say whether several pins, and most, are nearly as large as each other: trabeculae are of any size."""
     return bool(pins) and _count_alike(pins, _ALIKE) >= max(LEAST_OF_A_KIND, _MOST * len(pins))
+
+
+def are_as_thick(pins: list[NeedleFit]) -> bool:
+    """Say whether several pins, and most, are about as thick as each other: in a limb they lie aslant, and look as long as that leaves."""
+    if not pins:
+        return False
+    thick = _log_sizes(pins)[:, 0]
+    alike = np.abs(thick - np.median(thick)) < _AS_THICK
+    return bool(np.count_nonzero(alike) >= max(LEAST_OF_A_KIND, _MOST * len(pins)))
 
 
 def without_company(pins: list[NeedleFit]) -> list[bool]:

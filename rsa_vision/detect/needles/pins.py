@@ -18,10 +18,11 @@ from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
 from rsa_vision.detect.needles.first_pins import best_tapered, distinct, likest_pins
 from rsa_vision.detect.needles.fits import between, excess_of, fit_needles, significant_misfit
-from rsa_vision.detect.needles.of_a_kind import are_alike, are_of_a_kind, odd_lengths, others_like, without_company
+from rsa_vision.detect.needles.of_a_kind import are_alike, are_as_thick, are_of_a_kind, odd_lengths, others_like, without_company
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
 from rsa_vision.detect.needles.pointed import (
     EXPLAINED,
+    LEAST_OF_A_KIND,
     STANDS_OUT_ROUGHLY,
     SURER_THAN_ROD,
     is_pin,
@@ -32,7 +33,7 @@ from rsa_vision.detect.needles.pointed import (
     turned,
     unexplained,
 )
-from rsa_vision.detect.needles.sets import MOST_TOGETHER, TAPERS, fit_all, on_arms, others_beside
+from rsa_vision.detect.needles.sets import MOST_TOGETHER, TAPERS, fit_all, is_located, on_arms, others_beside
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.types import Bool, Float
 
@@ -89,7 +90,8 @@ def find_pins(
         return found
     trials = [optics, *(replace(optics, sigma_px=sigma) for sigma in _OTHER_BLURS_PX)]
     more = _found_from(film, rough, places, tees, sign, trials, noise)
-    return more if are_of_a_kind(more[0]) else found
+    better = are_as_thick(more[0]) and sum(map(is_located, more[0])) > sum(map(is_located, found[0]))
+    return more if better or are_of_a_kind(more[0]) else found
 
 
 def _found_from(
@@ -116,8 +118,11 @@ def _found_from(
     fits = [[_refit(film, replace(f, shape=shape), even, noise) for shape in shapes] for f, shapes in zip(rough, starts, strict=True)]
     if len(trials) > 1:  # optics were guessed at first: whichever way round a pin began says little
         fits = [[*ways, *(_refit_turned(film, f, even, noise) for f in ways)] for ways in fits]
-    pins = [min(ways, key=unexplained) for ways in fits]
-    pins = pointed(film, distinct(_still(pins, noise)), optics, noise)
+    best = [min(ways, key=unexplained) for ways in fits]
+    pins = pointed(film, distinct(_still(best, noise)), optics, noise)
+    if len(pins) >= LEAST_OF_A_KIND:  # then there may be others, with as sharp a point on another length
+        others = [_otherwise_tapered(film, f, tapers, even, noise) for f in best if not is_pin(f, noise, STANDS_OUT_ROUGHLY)]
+        pins = distinct([*pins, *pointed(film, distinct(_still(others, noise)), optics, noise)])
     pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
     start = _without_what_they_told(optics, known)
     pins, optics = fit_shared(film, pins, start, noise, parallel=False, alike=True)
@@ -264,6 +269,12 @@ def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
 def _still(pins: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
     """Leave out what looks like none."""
     return [f for f in pins if is_pin(f, noise, STANDS_OUT_ROUGHLY)]
+
+
+def _otherwise_tapered(film: NDArray[Any], fit: NeedleFit, tapers: Sequence[float], optics: Optics, noise: NoiseModel) -> NeedleFit:
+    """Fit with each of these tapers; return what leaves least."""
+    others = (_refit(film, replace(fit, shape=replace(fit.shape, taper=taper)), optics, noise) for taper in tapers)
+    return min([fit, *others], key=unexplained)
 
 
 def _refit_turned(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
