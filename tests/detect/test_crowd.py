@@ -54,3 +54,9 @@ def test_faint_marks_are_lost_among_texture_only() -> None:
         at = np.concatenate([balls, places])
         candidates = Candidates(at, np.full(len(at), 4.4), strength, np.full(len(at), 0.8), np.zeros((0, 5)), np.zeros((0, 6)))
         assert np.flatnonzero(lost_in_a_crowd(fits, candidates)).tolist() == lost
+    few = np.arange(1, 4)  # most of these are lost: that the third is explained a little more closely says nothing
+    strength = np.concatenate([own[few], rng.uniform(6.6, 9.0, 400)])
+    candidates = Candidates(
+        np.concatenate([balls[few], places]), np.full(403, 4.4), strength, np.full(403, 0.8), np.zeros((0, 5)), np.zeros((0, 6))
+    )
+    assert lost_in_a_crowd(fits.rows(few), candidates).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.balls.usual import kinds_by_size, over_kinds
@@ -103,6 +104,23 @@ def test_where_many_images_are_two_balls_nearly_in_one_beam() -> None:
     print(f"{unflagged} of {doubles} without a flag, {flagged} of {singles} single balls flagged")
     assert unflagged <= 0.1 * doubles
     assert flagged <= 0.02 * singles
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.6])
+def test_squares_are_no_balls(turned: float) -> None:
+    """Dots of burnt-in text, as large as balls and as sharp: all alike, so that they are not odd among each other, and alone on a film."""
+    rng = np.random.default_rng(7)
+    truth, _ = grid_of_balls(rng, 3, 200.0, (4.0, 4.0))
+    rows, cols = np.mgrid[0 : 5 * SIDE, 0 : 5 * SIDE] / 5 - 0.4
+    dots = np.zeros(rows.shape)
+    for x, y in truth:
+        near = np.s_[int(5 * y) - 40 : int(5 * y) + 40, int(5 * x) - 40 : int(5 * x) + 40]
+        along, across = cols[near] - x, rows[near] - y
+        along, across = along * np.cos(turned) + across * np.sin(turned), across * np.cos(turned) - along * np.sin(turned)
+        dots[near] = np.maximum(dots[near], (np.maximum(np.abs(along), np.abs(across)) < 4.0))
+    seen = gaussian_filter(dots, 5.0).reshape(SIDE, 5, SIDE, 5).mean((1, 3))
+    found = detect_markers(stored(30000 * (1 - 0.5 * seen + 0.01 * rng.standard_normal((SIDE, SIDE)))), bits=16).images
+    assert (found.flags > 0).all()
 
 
 def test_what_is_larger_is_compared_with_its_own_kind() -> None:

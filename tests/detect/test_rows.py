@@ -112,13 +112,15 @@ def test_a_ball_that_is_deeper_or_larger_is_not_of_a_row_beside_it() -> None:
 def test_what_is_like_those_in_rows_near_them_and_like_no_ball_elsewhere_is_of_their_screw() -> None:
     position = np.concatenate([line(9.0 * np.arange(5.0)), line(9.0 * np.array([7.3, 13.4])), line(np.array([-300.0, -350.0]))])
     rowed, depth = np.arange(9) < 5, np.array([-300.0, -310.0, -290.0, -320.0, -280.0, -300.0, -300.0, -700.0, -720.0])
-    radius = np.array([2.4] * 7 + [2.8, 1.8])
-    assert like_those_in_rows(position, radius, depth, rowed).tolist() == [False] * 5 + [True, True, False, False]
-    as_faint = np.append(depth[:8], -300.0)
-    assert not like_those_in_rows(position, np.append(radius[:8], 2.4), as_faint, rowed).any()  # a ball elsewhere is the same
+    radius, poor = np.array([2.4] * 7 + [2.8, 1.8]), np.zeros(9, bool)
+    assert like_those_in_rows(position, radius, depth, rowed, poor).tolist() == [False] * 5 + [True, True, False, False]
+    as_faint, as_large = np.append(depth[:8], -300.0), np.append(radius[:8], 2.4)
+    assert not like_those_in_rows(position, as_large, as_faint, rowed, poor).any()  # a ball elsewhere is the same
+    last = np.arange(9) == 8
+    assert like_those_in_rows(position, as_large, as_faint, rowed, last)[5:7].all()  # but of what is none itself
     deeper = np.append(depth[:6], [-700.0, -700.0, -720.0])
-    assert like_those_in_rows(position, radius, deeper, rowed).tolist() == [False] * 5 + [True, False, False, False]
-    assert not like_those_in_rows(position, radius, depth, np.zeros(9, bool)).any()
+    assert like_those_in_rows(position, radius, deeper, rowed, poor).tolist() == [False] * 5 + [True, False, False, False]
+    assert not like_those_in_rows(position, radius, depth, np.zeros(9, bool), poor).any()
 
 
 def test_true_balls_in_line_four_diameters_apart_keep_their_names() -> None:

@@ -15,6 +15,7 @@ _AS_STRONG = 0.6  # of the filter's answer
 _MANY = 3  # times as many others as balls, all so strong
 _NEAR_PX = 2.0  # beyond the rim, what still is an answer to a ball
 _BY_NOISE = 5.5  # local spreads, to which noise alone makes the filter answer hardly anywhere on a film
+_CLOSER = 0.98  # part of the variance that is explained of a ball among those that are lost
 _PASSES = 1 / 20  # of what stands out of a texture, this part passes for balls
 
 
@@ -42,7 +43,7 @@ def out_of_a_crowd(balls: BallFits, candidates: Candidates) -> Bool:
 def lost_in_a_crowd(balls: BallFits, candidates: Candidates) -> Bool:
     """Say which balls may be texture though others of the film are marks: so much of that is as strong that one is expected to look so.
 
-    What noise alone may make is no texture, and what a model explains closely is a ball.
+    What noise alone may make is no texture, and what a model explains closely is a ball; more closely still, where most are lost.
 
     Parameters
     ----------
@@ -56,7 +57,9 @@ def lost_in_a_crowd(balls: BallFits, candidates: Candidates) -> Bool:
     """
     own, others = _answers(balls, candidates)
     as_strong = (others >= np.maximum(own, _BY_NOISE)[:, None]).sum(axis=1)
-    return np.asarray((_PASSES * as_strong > 1) & (own > 0.0) & (balls.explained < CLOSE))
+    perhaps = (_PASSES * as_strong > 1) & (own > 0.0)
+    lost = perhaps & (balls.explained < CLOSE)
+    return np.asarray(perhaps & (balls.explained < _CLOSER) if np.count_nonzero(lost) > len(lost) / 2 else lost)
 
 
 def _answers(balls: BallFits, candidates: Candidates) -> tuple[Float, Float]:

@@ -137,6 +137,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     # where few quanta come through a linear film shows small depths, and little noise: either may be compared
     over_noise = height / np.sqrt(noise.variance_at(fits.background))
     high_enough = (height > least * typical) | (over_noise > least * np.median(over_noise[pattern]))
+    # and at the ends of a film curve all is low: there it is those on about the same background that tell
+    high_enough |= height > UNEXCUSED * _near_in_background(height, fits.background, pattern)
     sure &= high_enough
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
@@ -144,6 +146,13 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
         quiet = sure & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.chi2_ring < _QUIET) & (strength > ALONE)
         alike |= quiet & (fits.radius_px < high) & (_of_like_spread(_spread(fits, sigma_px), quiet) >= LEAST_KNOWN)
     return np.asarray((fits.significance > limit) & seen & alike & (sure | (strength > 0.5 * SURE)))
+
+
+def _near_in_background(height: Float, background: Float, pattern: Bool) -> Float:
+    """Median height of the few of a pattern next to each in background, shape (n,)."""
+    away = np.abs(background[:, None] - background[pattern])
+    nearest = np.argsort(away, axis=1, kind="stable")[:, :LEAST_KNOWN]
+    return np.asarray(np.median(height[pattern][nearest], axis=1))
 
 
 def show_what_marks_are_like(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> bool:

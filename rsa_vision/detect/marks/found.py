@@ -318,8 +318,9 @@ def _measured(
     balls, ratio, touching, poor, rowed = balls.rows(keep), ratio[keep], touching[keep], poor[keep], around.rowed[keep]
     added = added[np.append(keep, np.ones(len(others), bool))]
     poor = rowed | np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
-    doubtful = rowed | like_those_in_rows(balls.position_px, balls.radius_px, balls.depth, rowed) | cut_from_outlines(touching, ends[keep])
-    doubtful |= lost_in_a_crowd(balls, _off_needles(faint, others)) | are_holes(film, balls, optics.sigma_px)
+    doubtful = rowed | like_those_in_rows(balls.position_px, balls.radius_px, balls.depth, rowed, poor)
+    doubtful |= cut_from_outlines(touching, ends[keep]) | are_holes(film, balls, optics.sigma_px)
+    doubtful |= lost_in_a_crowd(balls, _off_needles(faint, others))
     # a pin has one arm: what hides a part of it is felt at its tip
     touching = np.concatenate([touching, np.zeros(len(needles.tees), bool), lapped(needles.pins, balls, optics)])
     return table_of(film, bits, balls, under, ratio, added, touching, poor, doubtful, others, faint.junctions, optics, noise)

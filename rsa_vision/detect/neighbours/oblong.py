@@ -1,6 +1,6 @@
-"""Images longer one way than the other: two balls nearly in one beam, that one ball fits in noise but for their outline.
+"""Images that are not round: two balls nearly in one beam, that one ball fits in noise but for their outline, and dots of burnt-in text.
 
-What is the same on opposite sides of the centre does not move it, and is not asked for elsewhere; two in one leave just that.
+What is the same on opposite sides of the centre does not move it, and is not asked for elsewhere; two in one leave just that, and squares.
 """
 
 from __future__ import annotations
@@ -34,15 +34,17 @@ _MUCH_LEFT, _MORE_LEFT, _SURE_OF_MORE = 3.0, 1.6, 28.0
 _QUIET = 0.5  # chi2 beside balls: filters that leave less noise there than under them make outlines as well
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
-_BENDS = np.arange(7, 12)  # of what is fitted: slopes and bends of the background
+_CORNERS = 0.04  # of the radius, by which its outline goes in and out four times: half of what a square as wide as blurred ones does
+_BENDS = np.arange(9, 14)  # of what is fitted: slopes and bends of the background
 _STEP_PX = 0.1  # for derivatives
 
 
 def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> Bool:
-    """Say which images are longer one way than the other, beyond what images of the film are and beyond noise and structure around.
+    """Say which images are longer one way than the other, or square, beyond what images of the film are, noise and structure around.
 
     To first order: with second moments that differ by ``m`` between the long axis and the short one, as two images ``d`` apart have
-    ``m = d^2 / 4``, an image ``f(s)`` changes by ``m / 4 cos(2 (phi - phi0)) (f'' - f' / s)``.
+    ``m = d^2 / 4``, an image ``f(s)`` changes by ``m / 4 cos(2 (phi - phi0)) (f'' - f' / s)``; by ``-e cos(4 (phi - phi0)) f'``
+    where its outline goes out and in by ``e`` four times.
 
     Parameters
     ----------
@@ -58,11 +60,11 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
     """
     if len(balls.depth) == 0:
         return np.zeros(0, bool)
-    apart, covariance = _outlines(film, balls, beside, optics, noise)
-    if len(apart) >= _LEAST_KNOWN:
-        apart = apart - np.median(apart, axis=0)  # a focal spot draws all images alike
+    outlines, covariance = _outlines(film, balls, beside, optics, noise)
+    if len(outlines) >= _LEAST_KNOWN:
+        outlines[:, :2] -= np.median(outlines[:, :2], axis=0)  # a focal spot draws all images alike
     covariance = covariance * np.maximum(balls.chi2_ring, 1.0)[:, None, None]
-    chance = np.einsum("ni,ni->n", apart, np.linalg.solve(covariance, apart[:, :, None])[:, :, 0])
+    apart, chance = outlines[:, :2], _chi2(outlines[:, :2], covariance[:, :2, :2])
     length = np.hypot(*apart.T) / balls.radius_px**2
     usual = max(1.0, float(np.median(chance)) / _MEDIAN)
     told = (chance > _SURE) & (length > _LEAST)
@@ -87,7 +89,13 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
         told |= much
     if most:
         told |= (chance > _AMONG_OTHERS) & (length > _MUCH)
-    return np.asarray(told)
+    square = _chi2(outlines[:, 2:], covariance[:, 2:, 2:]) > _BEYOND_DOUBT
+    return np.asarray(told | (square & (np.hypot(*outlines[:, 2:].T) > _CORNERS * balls.radius_px)))
+
+
+def _chi2(of: Float, covariance: Float) -> Float:
+    """Squares (n,) of vectors (n, p) in units of their covariances (n, p, p)."""
+    return np.asarray(np.einsum("ni,ni->n", of, np.linalg.solve(covariance, of[:, :, None])[:, :, 0]))
 
 
 def _larger(radius_px: Float) -> Bool:
@@ -97,10 +105,10 @@ def _larger(radius_px: Float) -> Bool:
 
 
 def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
-    """Differences of second moments, ``m cos(2 phi0)`` and ``m sin(2 phi0)`` in px^2 (n, 2), and their covariances."""
+    """``m cos(2 phi0)`` and ``m sin(2 phi0)``, px^2, and ``e cos(4 phi0)`` and ``e sin(4 phi0)``, px (n, 4), and their covariances."""
     halves = np.array([half_size(r, optics.sigma_px) for r in balls.radius_px])
     table = ball_table(optics.sigma_px, optics.mu_px)
-    out, covariance = np.zeros((len(halves), 2)), np.zeros((len(halves), 2, 2))
+    out, covariance = np.zeros((len(halves), 4)), np.zeros((len(halves), 4, 4))
     for half in np.unique(halves):
         index = np.flatnonzero(halves == half)
         fits, side = balls.rows(index), 2 * int(half) + 1
@@ -116,9 +124,11 @@ def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optic
         farther = slopes(table, dx * longer, dy * longer, fits.radius_px, optics.sigma_px)[1:3]
         falls, then = ((of[0] * dx + of[1] * dy) / reach for of in (by, farther))
         bend = (then - falls) / _STEP_PX - falls / reach
-        outline = 0.25 * bend[:, None] * np.stack([(dx**2 - dy**2) / square, 2 * dx * dy / square], axis=1)
+        cos, sin = (dx**2 - dy**2) / square, 2 * dx * dy / square  # of twice the angle
+        twofold = 0.25 * bend[:, None] * np.stack([cos, sin], axis=1)
+        fourfold = falls[:, None] * np.stack([cos**2 - sin**2, 2 * cos * sin], axis=1)
         surface = np.broadcast_to(polynomial(int(half), cols - half, rows - half).T, (len(index), 6, side**2))
-        moves = fits.depth[:, None, None] * np.concatenate([np.stack(by, axis=1), outline], axis=1)
+        moves = fits.depth[:, None, None] * np.concatenate([np.stack(by, axis=1), twofold, fourfold], axis=1)
         images = np.concatenate([moves, value[:, None], surface], axis=1)
         root = np.sqrt(valid / noise.variance_at(fits.background[:, None] + fits.depth[:, None] * value))
         white = whiten_rows(images * root[:, None], side, noise)
@@ -128,5 +138,5 @@ def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optic
         normal[:, _BENDS, _BENDS] += grounds_cut_off(patches.values.reshape(len(index), -1), valid, outside, noise)[0]
         inverse = invert(normal)
         change = np.matmul(inverse, np.matmul(white, left[:, :, None]))[:, :, 0]
-        out[index], covariance[index] = change[:, 3:5], inverse[:, 3:5, 3:5]
+        out[index], covariance[index] = change[:, 3:7], inverse[:, 3:7, 3:7]
     return out, covariance

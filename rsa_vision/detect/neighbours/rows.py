@@ -66,7 +66,7 @@ def in_rows(position_px: Float, radius_px: Float, depth: Float) -> Bool:
     return out
 
 
-def like_those_in_rows(position_px: Float, radius_px: Float, depth: Float, rowed: Bool) -> Bool:
+def like_those_in_rows(position_px: Float, radius_px: Float, depth: Float, rowed: Bool, poor: Bool) -> Bool:
     """Say which balls near rows have the size and the depth of several of those in rows, and not of one other ball of the film.
 
     Of a screw that shows many crests some are seen out of step, or too few beside each other.
@@ -79,6 +79,8 @@ def like_those_in_rows(position_px: Float, radius_px: Float, depth: Float, rowed
         In film values.
     rowed : ndarray of bool, shape (n,)
         As of :func:`in_rows`.
+    poor : ndarray of bool, shape (n,)
+        Not described well: these are no marks that others might be like.
 
     Returns
     -------
@@ -100,7 +102,7 @@ def like_those_in_rows(position_px: Float, radius_px: Float, depth: Float, rowed
         found |= more
     of_screw = rowed.copy()
     of_screw[perhaps[found]] = True
-    out[perhaps[found]] = ~like(perhaps[found], ~of_screw).any(axis=1)
+    out[perhaps[found]] = ~like(perhaps[found], ~(of_screw | poor)).any(axis=1)
     return out
 
 
