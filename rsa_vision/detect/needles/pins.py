@@ -41,8 +41,10 @@ _OTHER_BLURS_PX = BLURS_PX[1::2]  # of pins on films whose balls have another
 _KNOWN = 0.12  # of its length, to which the tip of a pin is known even at CNR 5: trabeculae are pointed anyhow
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
-# errors along a pin over its length, by the third power of the curve, by it and the logarithm of the depth, by the others
-_OF_CURVE, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.015, 0.05, 0.03, 2.0
+# errors along a pin over its length: of what beams and film curves are besides, by the curve and the logarithm of the depth, by the others
+_OF_MODEL, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.003, 0.05, 0.03, 2.0
+# by how far a curve is from those of logarithms and roots, whose skewness is so much of their shift; the same by its third power as well
+_OF_CURVE, _OF_STEEP, _SKEWED = 0.03, 0.007, -0.2
 # tail below which a film may have been sharpened, by how much less it surely was, and error along a pin by that in units of the blur
 _OF_LIGHT, _OF_LIGHT_ERROR, _BY_SHARPENING = -0.1, 0.1, 0.8
 _NO_OTHER = 0.15  # from a usual taper: the last fit gets there itself
@@ -121,8 +123,9 @@ def _found_from(
     best = [min(ways, key=unexplained) for ways in fits]
     pins = pointed(film, distinct(_still(best, noise)), optics, noise)
     if len(pins) >= LEAST_OF_A_KIND:  # then there may be others, with as sharp a point on another length
-        others = [_otherwise_tapered(film, f, tapers, even, noise) for f in best if not is_pin(f, noise, STANDS_OUT_ROUGHLY)]
-        pins = distinct([*pins, *pointed(film, distinct(_still(others, noise)), optics, noise)])
+        odd = [_otherwise_tapered(film, f, tapers, even, noise) for f in best if not is_pin(f, noise, STANDS_OUT_ROUGHLY)]
+        others = pointed(film, distinct(_still(odd, noise)), optics, noise)
+        pins = distinct([*pins, *others]) if others else pins
     pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
     start = _without_what_they_told(optics, known)
     pins, optics = fit_shared(film, pins, start, noise, parallel=False, alike=True)
@@ -306,7 +309,9 @@ def _less_sure_along(fit: NeedleFit, typical: float, odd_px: float, optics: Opti
     by_rest = _OF_MISFIT * significant_misfit(fit, noise) / np.sqrt(excess_of(fit, noise))  # by that the table widens all of it
     # where film responds more or less than usual, it is bent more or less as well
     unlike = abs(math.log(fit.depth / typical))
-    by_model = np.array([_OF_CURVE * optics.curve[0] ** 3, _OF_UNLIKE * optics.curve[0] * unlike, _OF_TAIL * optics.tail, by_rest])
+    shift, skewness = optics.curve
+    by_curve = (_OF_CURVE + _OF_STEEP * abs(shift) ** 3) * (skewness - _SKEWED * shift)
+    by_model = np.array([_OF_MODEL, by_curve, _OF_UNLIKE * shift * unlike, _OF_TAIL * optics.tail, by_rest])
     sharpened = between((_OF_LIGHT - optics.tail) / _OF_LIGHT_ERROR, 0.0, 1.0)
     parts = [odd_px, _POINT * fit.shape.half_width_px, _BY_SHARPENING * sharpened * optics.sigma_px, *(fit.shape.length_px * by_model)]
     error_px = float(np.linalg.norm(parts))
