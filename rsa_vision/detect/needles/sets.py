@@ -22,6 +22,7 @@ from rsa_vision.types import Bool, Float
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
 MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
 NEAREST_PX = 3.0  # two tips nearer than this are one
+_LOCATED = 1.5  # half widths: standard deviation of a tip from which it marks nothing
 _BESIDE_PX = 10.0  # from the ends of arms, a little longer than they are, within which others are beside them
 
 
@@ -90,7 +91,7 @@ def _images(near: list[NeedleFit], optics: Optics) -> Images | None:
 
 def is_located(needle: NeedleFit) -> bool:
     """Say whether the tip is known better than the needle is wide: the rim of something large is as long as one likes and marks nothing."""
-    return bool(np.linalg.eigvalsh(needle.covariance_px2)[-1] < (2 * needle.shape.half_width_px) ** 2)
+    return bool(np.linalg.eigvalsh(needle.covariance_px2)[-1] < (_LOCATED * needle.shape.half_width_px) ** 2)
 
 
 def as_usual(tee: NeedleFit, others: list[NeedleFit]) -> NeedleFit:
