@@ -13,7 +13,7 @@ from .films import film_of_balls, grid_of_balls, stored
 
 SIDE, CELL = 600, 60.0
 RADII = 3.0, 3.75
-FILMS = 4
+FILMS = 3
 
 
 @pytest.mark.parametrize("cnr", [10.0, 15.0])
