@@ -138,7 +138,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     over_noise = height / np.sqrt(noise.variance_at(fits.background))
     high_enough = (height > least * typical) | (over_noise > least * np.median(over_noise[pattern]))
     # and at the ends of a film curve all is low: there it is those on about the same background that tell
-    high_enough |= height > UNEXCUSED * _near_in_background(height, fits.background, pattern)
+    told = pattern | (sure & close & (fits.explained > CLOSE) & high_enough)
+    high_enough |= height > UNEXCUSED * _near_in_background(height, fits.background, told)
     sure &= high_enough
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
@@ -148,11 +149,11 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     return np.asarray((fits.significance > limit) & seen & alike & (sure | (strength > 0.5 * SURE)))
 
 
-def _near_in_background(height: Float, background: Float, pattern: Bool) -> Float:
-    """Median height of the few of a pattern next to each in background, shape (n,)."""
-    away = np.abs(background[:, None] - background[pattern])
+def _near_in_background(height: Float, background: Float, known: Bool) -> Float:
+    """Median height of the few known ones next to each in background, shape (n,)."""
+    away = np.abs(background[:, None] - background[known])
     nearest = np.argsort(away, axis=1, kind="stable")[:, :LEAST_KNOWN]
-    return np.asarray(np.median(height[pattern][nearest], axis=1))
+    return np.asarray(np.median(height[known][nearest], axis=1))
 
 
 def show_what_marks_are_like(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> bool:
