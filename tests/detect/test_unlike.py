@@ -136,6 +136,10 @@ def test_a_few_of_half_the_size_of_two_dozen_are_dots_and_not_beads(small: int, 
     assert odd[24:].all() == odd[24:].any() == flagged
     assert not of_odd_size(size[:24], np.full(24, 0.2**2)).any()
     assert not of_odd_size(np.append(np.full(24, 6.0), np.full(4, 4.5)), np.full(28, 0.02**2)).any()  # 0.8 and 0.6 mm
+    # of two in one beam noise lets nothing be seen but their size: less than three standard deviations from two others, and like none
+    scattered = np.array([4.3, 4.43, 4.49, 4.6, 4.78, 4.85, 4.87, 4.88, 4.96, 4.98, 5.07, 5.98])
+    error = np.array([0.16, 0.17, 0.15, 0.16, 0.19, 0.23, 0.19, 0.14, 0.24, 0.17, 0.25, 0.17])
+    assert np.flatnonzero(of_odd_size(scattered, error**2)).tolist() == [11]
 
 
 def test_tees_among_balls_need_company() -> None:

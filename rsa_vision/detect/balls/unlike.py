@@ -10,6 +10,7 @@ from rsa_vision.types import Bool, Float, Int
 
 COMPANY = 6  # marks of one kind that tell what is unlike them
 _ALIKE, _APART = 0.035, 3.0  # of radii of one kind, where curve and background differ; standard deviations
+_ALONE, _SURELY_ALONE = 0.1, 2.0  # logarithm, and standard deviations, by which not one other has the size of what is alone: two in one
 _SMALL, _FEW, _TIMES = 0.65, 6, 3  # of the usual size; fewer have that, and so many times as many do not: dust, dots of a date
 _BESIDE = 5  # known balls nearest in background, on either side
 _ENOUGH = 3  # of them, whose median is theirs
@@ -18,7 +19,7 @@ _CHANCE = 2.0  # standard deviations of two depths, each
 
 
 def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> Bool:
-    """Say which have a size that hardly another of the film has, where there are enough of one size: dots of letters, screw tips, dust.
+    """Say which have a size that hardly another of the film has, where there are enough of one: dots, screw tips, dust, two in one.
 
     Subjects have beads of one size in one bone and of another elsewhere, but not three of half the size of a few dozen.
 
@@ -34,14 +35,16 @@ def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> B
     ndarray of bool, shape (n,)
     """
     size, variance = np.log(size_px), variance_px2 / size_px**2
-    apart = np.abs(size[:, None] - size) / np.sqrt(variance[:, None] + variance + alike**2)
+    differ = np.abs(size[:, None] - size)
+    apart = differ / np.sqrt(variance[:, None] + variance + alike**2)
     company = (apart < _APART).sum(axis=1)
+    alone = ((differ < _ALONE) | (apart < _SURELY_ALONE)).sum(axis=1) == 1
     most = company.max(initial=0)
     if most < COMPANY:
         return np.zeros(len(size), bool)
     small = size < np.log(_SMALL) + size[company.argmax()]
-    fellows = (np.abs(size[:, None] - size) < -np.log(_SMALL)).sum(axis=1)
-    return np.asarray((company < LEAST_KNOWN) | (small & (fellows < _FEW) & (_TIMES * fellows <= np.count_nonzero(~small))))
+    fellows = (differ < -np.log(_SMALL)).sum(axis=1)
+    return np.asarray((company < LEAST_KNOWN) | alone | (small & (fellows < _FEW) & (_TIMES * fellows <= np.count_nonzero(~small))))
 
 
 def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:
