@@ -27,6 +27,11 @@ def invert(normal: Float) -> Float:
     return np.asarray(np.linalg.inv(normal / both + _RIDGE * np.eye(normal.shape[1])) / both)
 
 
+def chi2(of: Float, covariance: Float) -> Float:
+    """Return the squares (n,) of vectors (n, p) in units of their covariances (n, p, p)."""
+    return np.asarray(np.einsum("ni,ni->n", of, np.linalg.solve(covariance, of[:, :, None])[:, :, 0]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pixels:
     """Pixels of a window that are looked at, in the order of their distance from its middle: a ball reaches only the first of them.

@@ -39,7 +39,7 @@ from rsa_vision.detect.needles.tees import find_tees, is_tee
 from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, groups_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.neighbours.laid_on import fit_over, look_on_arms, over_arms
-from rsa_vision.detect.neighbours.oblong import are_oblong
+from rsa_vision.detect.neighbours.not_round import are_not_round
 from rsa_vision.detect.neighbours.rims import cut_from_outlines, goes_on
 from rsa_vision.detect.neighbours.rows import in_rows, like_those_in_rows
 from rsa_vision.detect.neighbours.under_curve import under_curve
@@ -313,7 +313,7 @@ def _measured(
     keep = left < _BENT * MISFIT
     ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
     keep &= ~(poor & ends)
-    poor[lone] |= are_oblong(film, single, lambda i, *at: beside(int(lone[i]), *at), optics, noise)
+    poor[lone] |= are_not_round(film, single, lambda i, *at: beside(int(lone[i]), *at), optics, noise)
     touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, touching, poor, rowed = balls.rows(keep), ratio[keep], touching[keep], poor[keep], around.rowed[keep]
     added = added[np.append(keep, np.ones(len(others), bool))]

@@ -17,7 +17,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.neighbours.blobs import CLEAR, LEAST_GAIN, NEARLY, OF_A_BLOB, STRETCH, long_axis
 from rsa_vision.detect.neighbours.group_images import GroupWindow, images_in, window_around
 from rsa_vision.detect.neighbours.groups import STEPS, fit_group
-from rsa_vision.detect.neighbours.oblong import are_oblong
+from rsa_vision.detect.neighbours.not_round import are_not_round
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
 
@@ -63,7 +63,7 @@ def optics_of_pairs(
     for some in (sure.rows(slice(_FEW)), sure):  # mostly a few are enough
         single = fit_at(film, some.position_px, some.radius_px, optics, noise, quick=True)
         close = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-        alone = close & ~are_oblong(film, single, _nothing, optics, noise)
+        alone = close & ~are_not_round(film, single, _nothing, optics, noise)
         if np.count_nonzero(alone) >= len(alone) / 3:
             return None
     rest = ~alone & np.isfinite(single.position_px).all(axis=1)

@@ -26,7 +26,7 @@ from rsa_vision.detect.neighbours.crowds import resolve_crowds
 from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
 from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.detect.neighbours.lines import without_lines
-from rsa_vision.detect.neighbours.oblong import are_oblong
+from rsa_vision.detect.neighbours.not_round import are_not_round
 from rsa_vision.detect.neighbours.spots import Drawn, find_spot, with_spot
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float, Int
@@ -148,7 +148,7 @@ def resolve_balls(
     clean &= ~perhaps_two(single, single.rows(clean), noise)
     asked = clean & promising(single, limit, optics.sigma_px, noise) & ~hopeless(single, optics.sigma_px, noise)
     one_each = single.rows(asked)
-    clean[asked] = ~are_oblong(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, beside, *at), optics, noise)
+    clean[asked] = ~are_not_round(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, beside, *at), optics, noise)
     sure = single.rows(clean)
     blobs = single.rows(~clean & ~_taken(single, sure))
     split = len(sure.depth) > 0 or needles is None  # else what arms leave is all there is

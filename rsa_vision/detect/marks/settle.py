@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.decide import EDGE
-from rsa_vision.detect.balls.equations import polynomial
+from rsa_vision.detect.balls.equations import chi2, polynomial
 from rsa_vision.detect.balls.find import CHANCE
 from rsa_vision.detect.balls.fits import BallFits, uneven_white
 from rsa_vision.detect.balls.focal_spot import shapes_of
@@ -177,7 +177,7 @@ def _fitted(
             hidden = _hidden(windows, solution, curve, common)
             fits.covariance[:, :2, :2] += both + hidden
             # there is an edge, which surfaces do not know: they are believed if they agree with it, or leave less
-            chance = np.einsum("ni,ni->n", apart, np.linalg.solve(balls.covariance[part, :2, :2], apart[:, :, None])[:, :, 0])
+            chance = chi2(apart, balls.covariance[part, :2, :2])
             stays = (fits.chi2_ring > STRUCTURE) | (better < -CHANCE) | ((chance > _AGREE) & (better < CHANCE))
             moved = free[part] & ~(edged[part] & stays)
             # surfaces that bend as the film does elsewhere promise more than they can at an edge: either model may be right
@@ -330,7 +330,7 @@ def _surprise(apart: Float, efficient: Float, plain: Float) -> Float:
     """
     size, of_plain = (np.maximum(np.trace(c, axis1=1, axis2=2), _TINY) for c in (efficient, plain))
     chance = np.maximum(1 - size / of_plain, _LEAST_CHANCE)[:, None, None] * plain + _TINY * np.eye(2)
-    square = np.einsum("ni,ni->n", apart, np.linalg.solve(chance, apart[:, :, None])[:, :, 0])
+    square = chi2(apart, chance)
     part = np.maximum(1 - _USUAL / np.maximum(square, _TINY), 0.0)
     return np.asarray(part[:, None, None] * apart[:, :, None] * apart[:, None])
 
@@ -343,8 +343,7 @@ def _held_over(values: NDArray[Any], near: Int, estimator: Float, known: Modes, 
     stated = stated + _by(estimator @ known.surface, variance_of(known, structure))
     stated = stated + _TINY * np.eye(2)  # a ball may lie wholly under others
     error = np.einsum("kip,kp->ki", estimator[near], values - mean[:, None])
-    square = np.einsum("ki,ki->k", error, np.linalg.solve(stated[near], error[:, :, None])[:, :, 0])
-    return np.asarray(square / noise.variance_at(mean) / _OF_CHANCE)
+    return np.asarray(chi2(error, stated[near]) / noise.variance_at(mean) / _OF_CHANCE)
 
 
 def _least(noise: NoiseModel) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -122,15 +123,27 @@ def distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
     return kept
 
 
-def best_tapered(film: NDArray[Any], first: NeedleFit, noise: NoiseModel) -> NeedleFit:
+def best_tapered(
+    film: NDArray[Any],
+    first: NeedleFit,
+    noise: NoiseModel,
+    optics: Optics = GUESS,
+    tapers: Sequence[float] = TAPERS,
+    *,
+    quick: bool = True,
+) -> NeedleFit:
     """Fit with the other tapers as well: what is a cylinder with a short point is longer as a cone, and leaves more.
 
     Parameters
     ----------
     film : ndarray of shape (rows, cols)
     first : NeedleFit
-        A first look.
+        With one taper.
     noise : NoiseModel
+    optics : Optics
+    tapers : sequence of float
+    quick : bool
+        As of :func:`rsa_vision.detect.needles.fits.fit_needles`.
 
     Returns
     -------
@@ -138,7 +151,7 @@ def best_tapered(film: NDArray[Any], first: NeedleFit, noise: NoiseModel) -> Nee
         That leaves least.
     """
     fits = [first]
-    for taper in (t for t in TAPERS if t != first.shape.taper):
+    for taper in (t for t in tapers if t != first.shape.taper):
         shape = replace(fits[-1].shape, taper=taper)
-        fits.append(fit_needles(film, fits[-1].position_px, fits[-1].angles, shape, GUESS, noise, quick=True))
+        fits.append(fit_needles(film, fits[-1].position_px, fits[-1].angles, shape, optics, noise, quick=quick))
     return min(fits, key=unexplained)

@@ -123,7 +123,7 @@ def _found_from(
     best = [min(ways, key=unexplained) for ways in fits]
     pins = pointed(film, distinct(_still(best, noise)), optics, noise)
     if len(pins) >= LEAST_OF_A_KIND:  # then there may be others, with as sharp a point on another length
-        odd = [_otherwise_tapered(film, f, tapers, even, noise) for f in best if not is_pin(f, noise, STANDS_OUT_ROUGHLY)]
+        odd = [best_tapered(film, f, noise, even, tapers, quick=False) for f in best if not is_pin(f, noise, STANDS_OUT_ROUGHLY)]
         others = pointed(film, distinct(_still(odd, noise)), optics, noise)
         pins = distinct([*pins, *others]) if others else pins
     pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
@@ -272,12 +272,6 @@ def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
 def _still(pins: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
     """Leave out what looks like none."""
     return [f for f in pins if is_pin(f, noise, STANDS_OUT_ROUGHLY)]
-
-
-def _otherwise_tapered(film: NDArray[Any], fit: NeedleFit, tapers: Sequence[float], optics: Optics, noise: NoiseModel) -> NeedleFit:
-    """Fit with each of these tapers; return what leaves least."""
-    others = (_refit(film, replace(fit, shape=replace(fit.shape, taper=taper)), optics, noise) for taper in tapers)
-    return min([fit, *others], key=unexplained)
 
 
 def _refit_turned(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:

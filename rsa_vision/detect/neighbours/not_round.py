@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.cut_off import grounds_cut_off
-from rsa_vision.detect.balls.equations import invert, polynomial
+from rsa_vision.detect.balls.equations import chi2, invert, polynomial
 from rsa_vision.detect.balls.fits import BallFits, half_size, slopes
 from rsa_vision.detect.balls.usual import over_kinds
 from rsa_vision.detect.film.noise import NoiseModel
@@ -39,7 +39,7 @@ _BENDS = np.arange(9, 14)  # of what is fitted: slopes and bends of the backgrou
 _STEP_PX = 0.1  # for derivatives
 
 
-def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> Bool:
+def are_not_round(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> Bool:
     """Say which images are longer one way than the other, or square, beyond what images of the film are, noise and structure around.
 
     To first order: with second moments that differ by ``m`` between the long axis and the short one, as two images ``d`` apart have
@@ -64,7 +64,7 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
     if len(outlines) >= _LEAST_KNOWN:
         outlines[:, :2] -= np.median(outlines[:, :2], axis=0)  # a focal spot draws all images alike
     covariance = covariance * np.maximum(balls.chi2_ring, 1.0)[:, None, None]
-    apart, chance = outlines[:, :2], _chi2(outlines[:, :2], covariance[:, :2, :2])
+    apart, chance = outlines[:, :2], chi2(outlines[:, :2], covariance[:, :2, :2])
     length = np.hypot(*apart.T) / balls.radius_px**2
     usual = max(1.0, float(np.median(chance)) / _MEDIAN)
     told = (chance > _SURE) & (length > _LEAST)
@@ -89,13 +89,8 @@ def are_oblong(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Opti
         told |= much
     if most:
         told |= (chance > _AMONG_OTHERS) & (length > _MUCH)
-    square = _chi2(outlines[:, 2:], covariance[:, 2:, 2:]) > _BEYOND_DOUBT
+    square = chi2(outlines[:, 2:], covariance[:, 2:, 2:]) > _BEYOND_DOUBT
     return np.asarray(told | (square & (np.hypot(*outlines[:, 2:].T) > _CORNERS * balls.radius_px)))
-
-
-def _chi2(of: Float, covariance: Float) -> Float:
-    """Squares (n,) of vectors (n, p) in units of their covariances (n, p, p)."""
-    return np.asarray(np.einsum("ni,ni->n", of, np.linalg.solve(covariance, of[:, :, None])[:, :, 0]))
 
 
 def _larger(radius_px: Float) -> Bool:
