@@ -241,3 +241,19 @@ def test_a_first_look_that_has_left_the_film_says_nothing_of_the_blur() -> None:
     without, evidence_without = estimate_optics(film, everywhere.rows(slice(4)), noise)
     assert optics.sigma_px == pytest.approx(without.sigma_px, rel=0.02)
     assert evidence == pytest.approx(evidence_without, rel=0.1)
+
+
+@pytest.mark.parametrize("blur_px", [0.8, 1.2])
+def test_many_of_one_size_that_noise_nearly_hides_are_marks(blur_px: float) -> None:
+    """No one of them stands out far where neighbours share the noise, and clutter might be so; but noise has more of what is fainter."""
+    rng = np.random.default_rng(3)
+    truth, radius = grid_of_balls(rng, 6, 90.0, (3.4, 3.6))
+    options = {"noise_sd": DEPTH * BACKGROUND / 5.5, "noise_blur_px": blur_px, "rng": rng}
+    film = film_of_balls((600, 600), truth, radius, depth=DEPTH, sigma_px=1.2, **options)  # type: ignore[arg-type]
+    found = detect_markers(stored(film), bits=16)
+    _, gap = nearest(truth, found)
+    print(f"{np.count_nonzero(gap < 2)} of {len(truth)} found, {len(found.images)} in all")
+    assert np.count_nonzero(gap < 2) >= 0.7 * len(truth)
+    assert len(found.images) == np.count_nonzero(gap < 2)
+    empty = film_of_balls((600, 600), truth[:0], radius[:0], **options)  # type: ignore[arg-type]
+    assert len(detect_markers(stored(empty), bits=16).images) == 0

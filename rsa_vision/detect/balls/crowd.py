@@ -15,8 +15,27 @@ _AS_STRONG = 0.6  # of the filter's answer
 _MANY = 3  # times as many others as balls, all so strong
 _NEAR_PX = 2.0  # beyond the rim, what still is an answer to a ball
 _BY_NOISE = 5.5  # local spreads, to which noise alone makes the filter answer hardly anywhere on a film
+_PLAIN = 1 / 3  # of their number: as much else, at the most, shows a film that is noise but for them
 _CLOSER = 0.98  # part of the variance that is explained of a ball among those that are lost
 _PASSES = 1 / 20  # of what stands out of a texture, this part passes for balls
+
+
+def all_but_noise(balls: BallFits, which: Bool, candidates: Candidates) -> bool:
+    """Say whether a film shows hardly anything beyond noise that is none of these balls.
+
+    Parameters
+    ----------
+    balls : BallFits
+    which : ndarray of bool, shape (n,)
+    candidates : Candidates
+        As for :func:`out_of_a_crowd`.
+
+    Returns
+    -------
+    bool
+    """
+    _, others = _answers(balls, candidates)
+    return bool(np.count_nonzero(others > _BY_NOISE) <= _PLAIN * np.count_nonzero(which)) and bool(which.any())
 
 
 def out_of_a_crowd(balls: BallFits, candidates: Candidates) -> Bool:

@@ -23,6 +23,9 @@ SPOT_PX = 0.85  # spread of an image below which it is a faulty pixel or dust on
 _LEAST_ROUND_PX = 1.0  # radius from which four pixels are seen of, or more: one pixel has any form
 LEAST_KNOWN = 3  # balls that tell what one of them is like on this film
 _COMPANY = 6  # sure ones of one size that stand for each other where none is clear enough for a pattern
+# as many of one size and height that noise alone would not make, so many times those nearly as significant: of mottle there are the more,
+# the less significant
+_MANY, _OF_BELOW, _NEARLY = 8, 3.0, 0.85
 _LIKE = 1.25  # images whose spreads are within this factor are of one size
 _SMALLER, _LARGER = 0.7, 1.45  # range of sizes around those of the sure ones: marks of one film are of few sizes
 _OF_CLEAR = 1.25  # ratio to the radius of any clear ball, where that is asked for
@@ -99,7 +102,7 @@ def _near_in_size(fits: BallFits, radii: Float) -> Bool:
     return np.asarray((fits.radius_px >= _SMALLER / _FAR * radii.min()) & (fits.radius_px < high))
 
 
-def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, *, mottled: bool = False) -> Bool:
+def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, *, mottled: bool = False, plain: bool = False) -> Bool:
     """Say which balls are marks.
 
     Parameters
@@ -113,6 +116,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     noise : NoiseModel
     mottled : bool
         The other polarity looks much the same: that there are many of one size says nothing.
+    plain : bool
+        All but what may be balls is noise: no more is asked of many of one size than what that would not make.
 
     Returns
     -------
@@ -130,6 +135,8 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
         fair = whole & (close | ((fits.chi2_ring < _QUIET) & (not mottled))) & ~_soft_shadows(fits.radius_px, height, known)
         alone = fair & (strength > (_AMONG_MOTTLE if mottled else ALONE))
         among = fair & (_of_like_spread(spread, alone) >= LEAST_KNOWN) & (not mottled)
+        if plain:
+            known |= above_noise(fits, limit, sigma_px, noise) & seen
         return np.asarray(known | alone | among | (_like_these(known, fits, height) & (strength > max(0.5 * SURE, limit)) & seen))
     typical = float(np.median(height[pattern]))
     # of fainter things on a film of clear marks noise is no excuse for what the model leaves
@@ -147,6 +154,23 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
         quiet = sure & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.chi2_ring < _QUIET) & (strength > ALONE)
         alike |= quiet & (fits.radius_px < high) & (_of_like_spread(_spread(fits, sigma_px), quiet) >= LEAST_KNOWN)
     return np.asarray((fits.significance > limit) & seen & alike & (sure | (strength > 0.5 * SURE)))
+
+
+def above_noise(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) -> Bool:
+    """Say which are of many of one size and height that noise would not make; as for :func:`are_balls`.
+
+    Where neighbours share noise, or marks are small, none stands out far. But of noise, or mottle, there is the more the less significant.
+    """
+    height = height_of(fits, sigma_px)
+    even = (fits.chi2_ring < _QUIET) & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.radius_px < RADIUS_PX[1])
+    above = even & (fits.significance > limit)
+    below = even & ~above & (fits.significance > _NEARLY * limit)
+    if np.count_nonzero(above) < _MANY:
+        return np.zeros(len(even), bool)
+    spread, typical = _spread(fits, sigma_px), float(np.median(height[above]))
+    like = above & (height > UNEXCUSED * typical) & (height < typical / UNEXCUSED)
+    among = _of_like_spread(spread, like)
+    return np.asarray(like & (among >= _MANY) & (among > _OF_BELOW * _of_like_spread(spread, below)))
 
 
 def _near_in_background(height: Float, background: Float, known: Bool) -> Float:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.crowd import lost_in_a_crowd, out_of_a_crowd
-from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, are_balls, faint_beside, look_clear, show_what_marks_are_like
+from rsa_vision.detect.balls.crowd import all_but_noise, lost_in_a_crowd, out_of_a_crowd
+from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, above_noise, are_balls, faint_beside, look_clear, show_what_marks_are_like
 from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, fit_at, misfit, plausible, short_of_end
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
@@ -195,17 +195,22 @@ def _find_balls(
         return np.asarray((np.sign(fits.depth) == sign) & ~_on_arms(fits, others))
 
     def decided(fits: BallFits) -> Bool:
-        return are_balls(fits, limit, optics.sigma_px, noise, mottled=mottled)
+        return are_balls(fits, limit, optics.sigma_px, noise, mottled=mottled, plain=plain)
+
+    def over_noise(fits: BallFits) -> Bool:
+        return above_noise(fits, limit, optics.sigma_px, noise)
 
     found = resolve_balls(film, mine, needles.looks, limit, optics, noise, needles.painted)
     found = found.rows(high(found.fits))
+    plain = not mottled and all_but_noise(found.fits, over_noise(found.fits), _off_needles(faint, others))
     found = found.rows(decided(found.fits) & bare(found.fits))
     more, at_edge, crossed = look_again(film, faint, found.fits, limit, optics, noise, needles.painted)
     like = decided(join([found.fits, more]))[len(found.fits.depth) :] & bare(more) & high(more)
     # the last fit does not know what was masked either
     found = found.and_more(more.rows(like), touching=False, edged=at_edge[like], crossed=crossed[like])
     if len(found.fits.depth) and not show_what_marks_are_like(found.fits, limit, optics.sigma_px, noise):
-        found = found.rows(look_clear(found.fits, noise) | out_of_a_crowd(found.fits, _off_needles(faint, others)))
+        clear = look_clear(found.fits, noise) | (over_noise(found.fits) & plain)
+        found = found.rows(clear | out_of_a_crowd(found.fits, _off_needles(faint, others)))
     if needles.painted is not None:
         found = _on_needles(film, faint, found, needles.painted, seen, limit)
     return _taken_apart(film, found, needles, optics, noise)
