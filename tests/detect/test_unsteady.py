@@ -57,3 +57,16 @@ def test_steady_lines_add_nothing_whether_noise_is_as_smooth_along_them_or_not(b
     print(f"error / stated along lines {along:.2f}, across {across:.2f}")
     assert 0.85 < along < 1.15
     assert 0.85 < across < 1.15
+
+
+@pytest.mark.parametrize("seed", [0, 5, 12])
+def test_few_lines_of_small_balls_in_white_noise_are_steady(seed: int) -> None:
+    """Three or four lines tell of a small ball, most of which its fit takes up: by chance errors were halved along one axis."""
+    rng = np.random.default_rng(seed)
+    balls, radii = grid_of_balls(rng, 5, 80.0, (2.0, 3.0))
+    balls += rng.uniform(-12, 12, balls.shape)
+    film = film_of_balls((440, 440), balls, radii, depth=0.5, sigma_px=0.8, noise_sd=1300.0, rng=rng)
+    images = detect_markers(stored(film), bits=16).images
+    sd = np.sqrt(images.covariance_px2[:, [0, 1], [0, 1]])
+    assert len(images) == 25
+    assert 0.9 < np.median(sd[:, 0] / sd[:, 1]) < 1.1

@@ -15,7 +15,7 @@ def in_vain(left: Sequence[float], by_noise: float) -> bool:
     Parameters
     ----------
     left : sequence of float
-        Weighted squares that each step left, from the one after ``WEIGHED`` on.
+        Weighted squares that each step left, with the same weights, from the one after ``WEIGHED`` on.
     by_noise : float
         What noise leaves of them: the number of pixels.
 

@@ -98,7 +98,8 @@ def marks_of(
     if beaded := _with_beaded(film, found, needles, seen):
         needles = beaded
         found, tees = _find_balls(film, mine, faint, needles, seen, limit, mottled=mottled)
-    needles = replace(needles, tees=tees)
+    if len(tees) != len(needles.tees) or any(t is not before for t, before in zip(tees, needles.tees, strict=True)):
+        needles = replace(needles, tees=tees, painted=_painted(tees, needles.pins, needles.tee_optics, needles.pin_optics))
     around = _around(film, found, needles, seen)
     if around.under > _MUCH_MORE and seen.noise.blur_px > _SMOOTHED * seen.optics.sigma_px:
         rougher = replace(seen, noise=seen.noise.blurred_by(_USUAL_BLUR * seen.optics.sigma_px))
@@ -301,7 +302,8 @@ def _measured(
 
     curve = noise_by_value(film, known.rows(clear), lambda i, *at: beside(int(clear[i]), *at), optics, noise)
     if curve is not None:
-        known = replace(known, covariance=under * known.covariance, chi2_uneven=known.chi2_uneven / under)
+        core, odd = known.chi2_core / under, known.chi2_uneven / under
+        known = replace(known, covariance=under * known.covariance, chi2_core=core, chi2_uneven=odd)
         noise, under = curve, 1.0
     bent, under_one_curve = under_curve(film, known, found.edged, clear, _undisturbed(found, optics), optics, noise, painted)
     found = replace(found, fits=bent, edged=found.edged & ~under_one_curve)

@@ -225,7 +225,8 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
         if len(clear) or needles > balls:
             optics = of_tees
     if needles <= balls < _ONE_BALL and (not len(clear) or needles == 0):  # where no tee is, clear junctions are something else
-        more = [p for p in look_for_pins(film, candidates.strokes, under) if np.sign(p.depth) == sign]
+        strokes = candidates.strokes[np.sign(candidates.strokes[:, 5]) == -sign]
+        more = [p for p in look_for_pins(film, strokes, under) if np.sign(p.depth) == sign]
         of_pins, evidence = optics_of_pins(film, of_sign + more, under)
         if balls < _LEAST_EVIDENCE or evidence > _OF_PINS:
             needles = evidence

@@ -113,11 +113,12 @@ def table_of(
     depth = np.abs(np.concatenate([balls.depth, [t.depth for t in needles]]))
     background = np.concatenate([balls.background, [t.background for t in needles]])
     flags = np.zeros(n + m, np.int64)
-    reach = np.concatenate([balls.radius_px + 1, [t.shape.length_px for t in needles]])
-    edge = (position < reach[:, None]).any(1) | (position[:, 0] > film.shape[1] - 1 - reach) | (position[:, 1] > film.shape[0] - 1 - reach)
+    low, high = _extent(balls, needles)
+    edge = ((low < 0) | (high > np.array(film.shape[::-1]) - 1)).any(axis=1)
     flags[edge] |= MarkerFlag.EDGE
     valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in needles]])
-    flags[(valid < WHOLE) & ~edge] |= MarkerFlag.SATURATED
+    for k in np.flatnonzero((valid < WHOLE) & ~edge):  # else something lies over it that is left out of the fit
+        flags[k] |= MarkerFlag.SATURATED if _at_an_end(film, low[k], high[k], noise) else MarkerFlag.OVERLAP
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[n:][[_noise_is_cut_off(t, noise) for t in needles]] |= MarkerFlag.SATURATED | MarkerFlag.CLIPPED
     flags[touching] |= MarkerFlag.OVERLAP
@@ -159,6 +160,25 @@ def table_of(
     trust = np.where(doubted, 0.0, np.interp(valid, (CUT_OFF, WHOLE), (OF_CUT_OFF, 1.0)))
     evidence = float(trust @ np.minimum(high, CAP)) * np.count_nonzero(~doubted) / max(n + m, 1)
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), evidence
+
+
+def _extent(balls: BallFits, needles: list[NeedleFit]) -> tuple[Float, Float]:
+    """Least and largest (col, row) of the images, shape (n + m, 2) each."""
+    half = balls.radius_px[:, None] + 1
+    low, high = [*(balls.position_px - half)], [*(balls.position_px + half)]
+    for fit in needles:
+        ends = fit.position_px + fit.shape.length_px * np.stack([np.cos(fit.angles), -np.sin(fit.angles)], axis=1)
+        points = np.concatenate([fit.position_px[None], ends])
+        low.append(points.min(axis=0) - fit.shape.half_width_px)
+        high.append(points.max(axis=0) + fit.shape.half_width_px)
+    return np.array(low).reshape(-1, 2), np.array(high).reshape(-1, 2)
+
+
+def _at_an_end(film: NDArray[Any], low: Float, high: Float, noise: NoiseModel) -> bool:
+    """Say whether pixels between these corners are at an end of the range."""
+    (left, top), (right, bottom) = np.floor(low).astype(int), np.ceil(high).astype(int) + 1
+    values = film[max(top, 0) : bottom, max(left, 0) : right]
+    return bool(((values <= noise.floor) | (values >= noise.ceiling)).any())
 
 
 def _noise_is_cut_off(fit: NeedleFit, noise: NoiseModel) -> bool:

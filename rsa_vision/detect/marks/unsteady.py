@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtrc
 
 from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.fits import BallFits, half_size
@@ -29,8 +30,8 @@ from rsa_vision.types import Bool, Float, Int
 _ASKED, _LEAST, _PLACES = 36, 6, 100  # balls that tell; free places of one size
 _SLOPING = 0.1  # of the information that the line with most has, from which one tells where it is
 _OUTLIER = 4.0  # times the median of what lines of marks leave
-_BY_CHANCE = 4.5  # standard deviations
-_OF_DIFFERENCE = 1.5  # variance of one of independent values less the mean of its two neighbours
+_BY_CHANCE = 3e-6  # of films with steady lines, that seem to have others: 4.5 standard deviations
+_LEFT = 0.1  # of the variance of what a line tells, that the fit has to leave
 _IN_A_ROW = 1.94  # sum of the squared correlations of such differences with each other
 _TINY = 1e-12
 _FADED = 3.0  # blur widths
@@ -54,28 +55,53 @@ class _Window:
     images: Float
     estimator: Float
 
-    def told_by(self, axis: int, way: int, left: Float) -> tuple[Float, Float]:
-        """Return how far lines seem displaced by what is left (..., s, s), from the neighbours of each, and the variances of that by noise.
-
-        Of lines along this axis (0: rows) by this coordinate, those that tell; shapes (..., lines) and (lines,).
-        """
-        slope, along = self.images[way], 1 - axis
-        whole = np.maximum(self.weight.sum(along, keepdims=True), _TINY)
-        slope = slope - (slope * self.weight).sum(along, keepdims=True) / whole  # lines may be brighter or darker as well
-        told = (slope**2 * self.weight).sum(along)
+    def told_by(self, axis: int, way: int) -> _Told:
+        """Return what tells how far lines along this axis (0: rows) are displaced by this coordinate."""
+        images, estimator, weight = (of if axis == 0 else of.swapaxes(-1, -2) for of in (self.images, self.estimator, self.weight))
+        slope, line = images[way], np.arange(len(weight))  # lines are rows now
+        whole = np.maximum(weight.sum(1, keepdims=True), _TINY)
+        tilt = slope - (slope * weight).sum(1, keepdims=True) / whole  # lines may be brighter or darker as well
+        told = (tilt**2 * weight).sum(1)
         tells = told > _SLOPING * told.max(initial=0.0)
-        chance = 1 / np.where(tells, told, np.inf)
-        off = chance * (slope * self.weight * left).sum(along - 2)
-        three = tells[:-2] & tells[1:-1] & tells[2:]
-        differ = off[..., 1:-1] - 0.5 * (off[..., :-2] + off[..., 2:])
-        variance = chance[1:-1] + 0.25 * (chance[:-2] + chance[2:])
-        return differ[..., three], variance[three]
+        middle = np.flatnonzero(tells[:-2] & tells[1:-1] & tells[2:]) + 1
+        each, displaced = np.zeros((2, len(line), *weight.shape))
+        each[line, line], displaced[line, line] = tilt * weight / np.where(tells, told, np.inf)[:, None], slope
+        by = each[middle] - 0.5 * (each[middle - 1] + each[middle + 1])
+        variance = 1 / np.where(weight > 0, weight, np.inf)
+        before = (by**2 * variance).sum((1, 2))
+        by = by - np.tensordot(np.tensordot(by, images, ((1, 2), (1, 2))), estimator, 1)  # what the fit takes up shows nowhere
+        noise, shown = (by**2 * variance).sum((1, 2)), np.square(np.tensordot(by, displaced, ((1, 2), (1, 2)))).sum(1)
+        left = noise > _LEFT * before
+        return _Told(by[left] if axis == 0 else by[left].swapaxes(1, 2), noise[left], shown[left])
 
     def beside(self, values: NDArray[Any]) -> Float:
         """Return what the fit would leave of free places (k, s * s), shape (k, s, s)."""
         images, estimator = (of.reshape(len(of), -1) for of in (self.images, self.estimator))
         centred = values - values.mean(axis=1, keepdims=True)
         return np.asarray(centred - (centred @ estimator.T) @ images).reshape(-1, *self.left.shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """How far lines seem displaced, each from its two neighbours.
+
+    Attributes
+    ----------
+    by : ndarray of shape (lines, s, s)
+        Products with what a fit leaves say how far.
+    noise : ndarray of shape (lines,)
+        Variance of that by noise.
+    shown : ndarray of shape (lines,)
+        Variance of that where lines are displaced by a variance of one.
+    """
+
+    by: Float
+    noise: Float
+    shown: Float
+
+    def off(self, left: Float) -> Float:
+        """How far lines seem displaced by what is left (..., s, s), shape (..., lines)."""
+        return np.tensordot(left, self.by, ((-2, -1), (1, 2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,28 +190,34 @@ def _displaced(windows: list[_Window], way: int, free: dict[int, NDArray[Any]]) 
     Rows by one coordinate are compared with columns by the other: along lines, or across them. ``free`` are places of these sides.
     """
     kinds = ((0, way), (1, 1 - way))
-    told = [[window.told_by(*kind, window.left) for window in windows] for kind in kinds]
-    count = np.array([[len(off) for off, _ in of] for of in told])
-    square = np.array([[(off**2 / chance).sum() for off, chance in of] for of in told])
+    told = [[window.told_by(*kind) for window in windows] for kind in kinds]
+    off = [[these.off(window.left) for these, window in zip(of, windows, strict=True)] for of in told]
+    count = np.array([[len(these.noise) for these in of] for of in told])
+    square = np.array(
+        [[(by**2 / these.noise).sum() for by, these in zip(of, those, strict=True)] for of, those in zip(off, told, strict=True)]
+    )
     mean = square / np.maximum(count, 1)
     keep = ((count > 0) & (mean <= _OUTLIER * np.median(mean, axis=1, keepdims=True))).all(axis=0)
     if np.count_nonzero(keep) < _LEAST:
         return None
     number = count[:, keep].sum(axis=1)
     of_each = square[:, keep].sum(axis=1) / number
-    by_chance = _BY_CHANCE * np.sqrt(2 * _IN_A_ROW * (1 / number).sum())
     more, less = int(np.argmax(of_each)), int(np.argmin(of_each))
-    if of_each[more] < (1 + by_chance) * of_each[less]:
-        return None
+    freedom = number / _IN_A_ROW
     beside = _at_free_places([window for window, kept in zip(windows, keep, strict=True) if kept], kinds, free)
     if not beside.all():  # no noise at all
         return None
-    of_noise = float(of_each[less] * beside[more] / beside[less])
-    if of_each[more] < (1 + by_chance) * of_noise:
+    of_noise = float(of_each[less] * max(beside[more] / beside[less], 1.0))
+    if fdtrc(freedom[more], freedom[less], of_each[more] / of_noise) > _BY_CHANCE:
         return None
-    off, chance = (np.concatenate(of) for of in zip(*(each for each, kept in zip(told[more], keep, strict=True) if kept), strict=True))
-    variance = ((off**2 - of_noise * chance) / chance**2).sum() / (_OF_DIFFERENCE * (1 / chance**2).sum())
-    return (*kinds[more], float(variance)), float(of_each[less])
+    by, noise, shown = (
+        np.concatenate(of)
+        for of in zip(
+            *((by, these.noise, these.shown) for by, these, kept in zip(off[more], told[more], keep, strict=True) if kept), strict=True
+        )
+    )
+    variance = (shown * (by**2 - of_noise * noise) / noise**2).sum() / (shown**2 / noise**2).sum()
+    return (*kinds[more], float(variance)), float(of_each[less] * (1 + np.sqrt(2 / freedom[less])))
 
 
 def _at_free_places(windows: list[_Window], kinds: tuple[tuple[int, int], ...], free: dict[int, NDArray[Any]]) -> Float:
@@ -193,9 +225,12 @@ def _at_free_places(windows: list[_Window], kinds: tuple[tuple[int, int], ...], 
     left = [(window, window.beside(free[len(window.left)])) for window in windows if len(window.left) in free][:_LEAST]
     if not left:
         return np.ones(len(kinds))
-    told = [[window.told_by(*kind, of) for window, of in left] for kind in kinds]
-    square = np.array([sum((off**2 / chance).sum() for off, chance in of) for of in told])
-    return np.asarray(square / [sum(off.size for off, _ in of) for of in told])
+    out = []
+    for kind in kinds:
+        told = [window.told_by(*kind) for window, _ in left]
+        square = [these.off(of) ** 2 / these.noise for these, (_, of) in zip(told, left, strict=True)]
+        out.append(np.concatenate([of.ravel() for of in square]).mean())
+    return np.array(out)
 
 
 def _of_ball(marks: Marks, i: int) -> _Window:

@@ -25,6 +25,7 @@ Unseen = Callable[[Float, Float], Bool]
 """Says at which pixels (cols, rows) something lies over needles that hides them."""
 
 _STEPS, _QUICK_STEPS = 16, 5
+_REWEIGHTED = (2, 6)  # steps after which the variance is taken where the model is by then
 _CONVERGED_PX = 0.02  # a step's change: what is left after it is a tenth of that, and the last fit follows
 _NEAR_PX = 0.1  # enough for a first look
 _LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
@@ -221,8 +222,9 @@ def fit_crossing(
         if edge and step in _LOOKED_AGAIN:
             deep = [replace(f, depths=np.full(f.angles.shape, depth)) for f, depth in zip(now, theta, strict=False)]
             surface = window.with_edge(deep, optics).surface
-        if step in (2, 6):
+        if step in _REWEIGHTED:
             weight = 1.0 / noise.variance_at(theta @ linear + window.beside)
+            left.clear()  # of other weights
         before, now = now, moved(now, delta, half)
         converged = (step > 0 or quick) and float(np.abs(delta[:, :2]).max()) < near
     return told()

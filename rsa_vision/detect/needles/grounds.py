@@ -53,7 +53,7 @@ def errors_by_ground(
     Returns
     -------
     list of ndarray of shape (m, 2, 2)
-        px^2, along and across the first arm of each.
+        px^2, (col, row).
     """
     noise, members = through.noise, [f for e in systems for f in e.members]
     length = np.array([f.shape.length_px for f in needles])
@@ -75,7 +75,8 @@ def errors_by_ground(
         free &= (gaps(centre, middle) > 0.5 * (span + across)).all(axis=1)
         boxes = [film[row : row + size[1], col : col + size[0]] for col, row in corner[free]]
         values = np.array([box.ravel().take(window.place) for box in boxes], np.float64).reshape(len(boxes), len(window.place))
-        whole = np.isfinite(values).all(axis=1)  # what lies over tees is blotted out while those under it are fitted
+        # what lies over tees is blotted out while those under it are fitted; what is saturated shows no bone
+        whole = ((values > noise.floor) & (values < noise.ceiling)).all(axis=1)
         centre, values = centre[free][whole], values[whole]
         level = values.mean(axis=1, keepdims=True)
         of_pixels = window.filtered(e.inverse[e.tips] @ e.own, through) * np.sqrt(e.weight)  # the filter is its own transpose

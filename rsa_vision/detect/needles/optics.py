@@ -37,7 +37,7 @@ def common_optics(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, 
     taper : float
         Part of their length over which they taper.
     """
-    alone = [c[0] for c in clusters(needles) if len(c) == 1] or needles
+    alone = [needles[c[0]] for c in clusters(needles) if len(c) == 1] or needles
     sample = sorted(alone, key=lambda f: f.misfit)
     sample = sample[: _SAMPLE // len(sample[0].angles)]
     fits, optics = fit_shared(film, sample, optics, noise, parallel=False, steps=_STEPS)

@@ -32,15 +32,15 @@ def fit_all(film: NDArray[Any], needles: list[NeedleFit], optics: Optics, noise:
     ``again``: sets of up to so many were fitted in the same way before, so that what has come to rest and has no neighbours stays as it is.
     """
     out: list[NeedleFit] = []
-    sets = clusters(needles)
+    sets = [[needles[i] for i in index] for index in clusters(needles)]
     for members, others in zip(sets, beside_each(sets, optics), strict=True):
         at_rest = len(members) <= again and others is None and all(m.converged for m in members)
         out += members if at_rest else fit_crossing(film, members, optics, noise, others=others)
     return out
 
 
-def clusters(needles: list[NeedleFit]) -> list[list[NeedleFit]]:
-    """Return the sets whose arms may cross, as far as one fit can hold them."""
+def clusters(needles: list[NeedleFit]) -> list[list[int]]:
+    """Return which needles make up the sets whose arms may cross, as far as one fit can hold them."""
     if not needles:
         return []
     position = np.array([t.position_px for t in needles])
@@ -50,7 +50,7 @@ def clusters(needles: list[NeedleFit]) -> list[list[NeedleFit]]:
     while True:  # arms that only just touch can do with subtraction, if joining them all would make too large a fit
         n, label = connected_components(csr_array(gap < reach), directed=False)
         if n == len(needles) or np.bincount(label).max() <= MOST_TOGETHER:
-            return [[needles[i] for i in np.nonzero(label == k)[0]] for k in range(n)]
+            return [np.flatnonzero(label == k).tolist() for k in range(n)]
         reach = reach * 0.85
 
 

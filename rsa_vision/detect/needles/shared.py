@@ -112,7 +112,7 @@ def fit_shared(
     Returns
     -------
     needles : list of NeedleFit
-        In another order. The covariance of a tip holds the errors of what is common.
+        In their order. The covariance of a tip holds the errors of what is common.
     optics : Optics
     """
     if not needles:
@@ -128,13 +128,16 @@ def fit_shared(
     at = at.after(step, systems, task.parallel)
     optics = moved_optics(task.start, at.moved)
     rest = AtRest(task.windows, systems, at.sets, step, task.telling, normal, precision, optics, through, converged)
-    return with_errors(film, rest, noise), optics
+    place = np.argsort([i for index in task.belong for i in index])
+    fitted = with_errors(film, rest, noise)
+    return [fitted[k] for k in place], optics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
     """What a fit of all needles of a film begins with."""
 
+    belong: list[list[int]]  # which needles are in each window
     windows: list[Window]
     at: State
     start: Optics
@@ -158,7 +161,8 @@ def _begin(
     alike: bool,
 ) -> _Task:
     taper = float(np.median([f.shape.taper for f in needles]))
-    sets = clusters([replace(f, shape=replace(f.shape, taper=taper)) for f in needles])
+    belong = clusters(needles)
+    sets = [[replace(needles[i], shape=replace(needles[i].shape, taper=taper)) for i in index] for index in belong]
     others = beside_each(sets, optics)
     if balls:
         others = [balls.and_others(o) for o in others]
@@ -184,7 +188,7 @@ def _begin(
     at = State(sets, np.zeros(len(precision)), taper, sizes, equal(sets), equal(sets), arms)
     telling = _telling(sets, noise) if alike else [True] * len(sets)
     typical = float(np.median([f.explained for f in needles]))
-    return _Task(windows, at, optics, precision, n_free, gain, telling, typical, parallel, alike)
+    return _Task(belong, windows, at, optics, precision, n_free, gain, telling, typical, parallel, alike)
 
 
 def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -> tuple[State, list[Equations], Float, Filter | None, bool]:

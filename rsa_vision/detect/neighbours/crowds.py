@@ -93,7 +93,7 @@ def resolve_crowds(
             break
         if (np.hypot(*(np.concatenate([vain, found.position_px]) - at).T) < radius).any():
             continue
-        crowd = _crowd(film, single.rows([i]), known, optics, noise, others)
+        crowd = _crowd(film, single.rows([i]), known, optics, noise, all_but(found, np.arange(0), optics, needles))
         if crowd is None:
             vain = np.concatenate([vain, at[None]])
         else:

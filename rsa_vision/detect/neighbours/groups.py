@@ -25,6 +25,7 @@ _MOST_PX, _LAST_PX = 0.5, 1.0  # of a step; of the last one, which is not held n
 _MOST_RADII = 0.12  # of a step, of large balls
 _ARRIVED = 12  # steps after which what still takes the longest ones is lost
 _STILL_PX = 0.05  # what hardly goes any farther where steps are in vain is there
+_REWEIGHTED = (4, 10)  # steps at which the variance is taken where the model is by then
 _LOOKED_AGAIN = (2, 5, 9)  # steps after which an edge is seen more clearly
 
 
@@ -107,8 +108,9 @@ def fit_group(
         residual = data - linear @ theta
         if step == steps or converged or ends:
             break
-        if step in (4, 10):
+        if step in _REWEIGHTED:
             weight = valid / noise.variance_at(linear @ theta + window.neighbours)
+            left.clear()  # of other weights
         if step > WEIGHED and k > 1 and not edge:  # what is compared with a fit beside an edge is to get there
             left.append(float(weight @ residual**2))
         vain = in_vain(left, float(valid.sum()))

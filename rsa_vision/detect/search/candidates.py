@@ -129,7 +129,7 @@ def _band_extrema(band: NDArray[Any], noise: NoiseModel, work: NDArray[np.float3
         at = (level, outer)
         answer = cv2.subtract(blurred, begun, dst=begun)
         spread = _local_spread(answer, _white_spread(noise, level, inner, outer))
-        limit = cv2.resize(STRENGTH * spread, (answer.shape[1], answer.shape[0]), dst=limit, interpolation=cv2.INTER_LINEAR)
+        limit = _over_blocks(STRENGTH * spread, limit)
         significance = cv2.divide(answer, limit, dst=limit)
         place = np.flatnonzero((significance > FAINT) | (significance < -FAINT))
         strength = np.asarray(significance.ravel()[place], np.float64)
@@ -223,11 +223,22 @@ def _white_spread(noise: NoiseModel, level: int, inner: float, outer: float) -> 
 
 
 def _local_spread(answer: NDArray[Any], least: float) -> NDArray[Any]:
-    """Median absolute deviation in blocks, as a standard deviation, on the grid of the blocks."""
-    n_rows, n_cols = max(1, answer.shape[0] // BLOCK), max(1, answer.shape[1] // BLOCK)
-    block_r, block_c = min(BLOCK, answer.shape[0]), min(BLOCK, answer.shape[1])
+    """Median absolute deviation in blocks, as a standard deviation, on the grid of the blocks; the last may stand over."""
+    over = [-n % BLOCK for n in answer.shape]
+    if any(over):
+        answer = cv2.copyMakeBorder(answer, 0, over[0], 0, over[1], cv2.BORDER_REFLECT)
+    n_rows, n_cols = (n // BLOCK for n in answer.shape)
     # every third pixel in either direction: the filter's own correlation makes the others nearly copies
-    part = np.abs(answer[: n_rows * block_r, : n_cols * block_c].reshape(n_rows, block_r, n_cols, block_c)[:, 1::3, :, 1::3])
+    part = np.abs(answer.reshape(n_rows, BLOCK, n_cols, BLOCK)[:, 1::3, :, 1::3])
     middle = medians(part.swapaxes(1, 2).reshape(n_rows, n_cols, -1)) / 0.6745
     spread: NDArray[Any] = np.maximum(middle, least).astype(np.float32)
     return spread
+
+
+def _over_blocks(grid: NDArray[Any], into: NDArray[Any]) -> NDArray[Any]:
+    """Interpolate what is known of blocks between their middles."""
+    size = (grid.shape[1] * BLOCK, grid.shape[0] * BLOCK)
+    if size == into.shape[::-1]:
+        return cv2.resize(grid, size, dst=into, interpolation=cv2.INTER_LINEAR)
+    into[:] = cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)[: into.shape[0], : into.shape[1]]
+    return into
