@@ -21,6 +21,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.arms import badly_placed, lone_tees, meet_others, perhaps_arms
 from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, excess_of, significant_misfit
 from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
+from rsa_vision.detect.needles.states import LEAST_TAPER
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import Bool, Float, MarkerImages
 
@@ -28,6 +29,8 @@ EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels an
 WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
 _LINE_PX = 1.01 * LEAST_HALF_WIDTH_PX  # half width of a needle that is a line
+_BLUNT = 1.01 * LEAST_TAPER  # needles that are no more pointed than a fit lets them be have no tip
+_SEVERAL = 5  # tees that tell of all
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
@@ -128,7 +131,10 @@ def table_of(
     snr = depth / np.sqrt(noise.variance_at(background))
     flags[n:][(arms == 3) & badly_placed(covariance[n:], radius[n:], snr[n:])] |= MarkerFlag.UNLIKE
     flags[n:][perhaps_arms(needles, junctions) | meet_others(film, needles) | (radius[n:] <= _LINE_PX)] |= MarkerFlag.UNLIKE
+    flags[n:][[t.shape.taper <= _BLUNT for t in needles]] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in needles]) > DOUBTFUL * MISFIT])
+    if np.count_nonzero(arms == 3) >= _SEVERAL and poor[n:][arms == 3].mean() > 0.5:  # what most of them are not, none is for sure
+        flags[n:][arms == 3] |= MarkerFlag.UNLIKE
     if n >= COMPANY:  # among balls a pin or two are more likely ends of rods, and a tee or two are letters of lead
         few = np.count_nonzero(arms == 1) < LEAST_OF_A_KIND
         flags[n:][((arms == 1) & few) | lone_tees(needles, ~poor[n:])] |= MarkerFlag.UNLIKE

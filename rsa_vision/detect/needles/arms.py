@@ -16,6 +16,8 @@ _FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these
 _AT_TIP = 0.35  # of a pin's length, from its tip to where three arms meet
 _AWAY = np.array([0.35, 0.5, 0.65])  # of a pin's length from its tip, where another is sought
 _AS_WIDE = 0.35  # logarithms of the half widths of the tees of a set, which stand for depth
+# logarithms of lengths that are alike; explained of tees, from which several, and each alone, are no letters
+_AS_LONG, _CLOSELY, _TO_THE_LAST = 0.2, 0.99, 0.995
 _WORSE, _BADLY = 4.0, 0.1  # times its half width over what a tee stands above noise; parts of that width
 _WAYS, _BESIDE, _OWN = 72, 6, 9  # directions; steps of these to what lies beside an arm, and within which all is the pin itself
 _AS_HIGH = 0.5  # of the pin's own height there
@@ -74,6 +76,9 @@ def _meets_others(film: NDArray[Any], pin: NeedleFit) -> bool:
 def lone_tees(needles: list[NeedleFit], sure: Bool) -> Bool:
     """Say which tees have not two sure ones beside them that are about as wide and parallel, as those of a set are.
 
+    Of those that are explained closely, it is enough that they are as long: of letters no model of pointed arms explains so much. What is
+    explained more closely still, needs no company.
+
     Parameters
     ----------
     needles : list of NeedleFit
@@ -86,10 +91,13 @@ def lone_tees(needles: list[NeedleFit], sure: Bool) -> Bool:
     """
     tee = np.array([len(f.angles) > 1 for f in needles], bool)
     width, angle = np.log([f.shape.half_width_px for f in needles]), np.array([f.angles[0] for f in needles])
-    parallel = np.abs(wrapped(angle[:, None] - angle)) < _PARALLEL
-    alike = parallel & (np.abs(width[:, None] - width) < _AS_WIDE) & tee & sure
+    length, form = np.log([f.shape.length_px for f in needles]), np.where(sure, [f.explained for f in needles], 0.0)
+    close = form > _CLOSELY
+    of_a_set = np.abs(wrapped(angle[:, None] - angle)) < _PARALLEL
+    of_a_set |= close[:, None] & close & (np.abs(length[:, None] - length) < _AS_LONG)
+    alike = of_a_set & (np.abs(width[:, None] - width) < _AS_WIDE) & tee & sure
     alike[np.diag_indices(len(tee))] = True
-    return np.asarray(tee & (alike.sum(axis=1) < LEAST_OF_A_KIND))
+    return np.asarray(tee & (alike.sum(axis=1) < LEAST_OF_A_KIND) & (form < _TO_THE_LAST))
 
 
 def badly_placed(covariance_px2: Float, half_width_px: Float, snr: Float) -> Bool:

@@ -39,7 +39,9 @@ AtJunction = Callable[..., NeedleFit | None]
 _BEFORE = 1.5  # tolerance before attenuation and ends are fitted
 ROUGH = 3.5  # tolerance of a first look, while neighbours still disturb
 ENOUGH = 6  # clean tees after which no more junctions are looked at: likeness finds the others
-_ASIDE, _ASKEW = 0.3, 0.6  # radians by which a junction may point aside; part that arms explain which lie between those of a tee
+# radians by which a junction may point aside, and parts of its ring's radius by which it may lie before or behind the tip, along the stem
+_STARTS = ((0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.25), (0.0, -0.25))
+_ASKEW = 0.4  # explained by a first start, from which others are worth it
 _TURNED = 0.2  # radians, from which a tee is not like another
 _SAME_JUNCTION = 0.5  # of the length of its arms, from a junction to the tip fitted to it
 _MOST_JUNCTIONS = 80
@@ -273,12 +275,13 @@ def _at_junctions(junctions: Float, taper: float, fitted_at: AtJunction) -> list
 def _at_junction(
     film: NDArray[Any], optics: Optics, noise: NoiseModel, taper: float, col: float, row: float, angle: float, ring: float, strength: float
 ) -> NeedleFit | None:
-    """Fit a tee at a junction, or aside from where that points, and return the best that may be one."""
+    """Fit a tee at a junction, or aside from where that points or lies, and return the best that may be one."""
     start = NeedleShape(float(np.clip(0.22 * ring, 1.2, 6.0)), 1.5 * ring, taper)
     tried: list[NeedleFit] = []
-    for turn in (0.0, _ASIDE, -_ASIDE):
+    for turn, along in _STARTS:
         angles = angle + turn + np.array([0.0, np.pi / 2, -np.pi / 2])
-        tried.append(fit_needles(film, np.array([col, row]), angles, start, optics, noise))
+        tip = np.array([col, row]) + along * ring * np.array([math.cos(angle), -math.sin(angle)])
+        tried.append(fit_needles(film, tip, angles, start, optics, noise))
         if is_tee(tried[-1]) or tried[0].explained < _ASKEW:
             break
     like = (f for f in tried if is_tee(f, slack=ROUGH) and f.depth * strength < 0)  # the answer has the other sign
