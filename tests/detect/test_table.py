@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.balls.find import fit_at
+from rsa_vision.detect.balls.find import fit_at, no_fits
 from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.marks.table import table_of, what_is_left
+from rsa_vision.detect.models.needles import NeedleShape
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.fits import unfit
 from rsa_vision.flags import MarkerFlag
 
 from .films import film_of_balls, grid_of_balls, stored
@@ -75,3 +77,32 @@ def test_what_all_balls_of_a_film_leave_is_no_fault_of_one() -> None:
     assert np.flatnonzero(with_misfit(left, 1.0, faint)).tolist() == [3]
     assert with_misfit(np.full(len(truth), 0.01), 20.0).sum() == 0  # 20 times so little noise is no edge
     assert with_misfit(np.full(len(truth), 0.01), 1 + (0.05 * DEPTH * BACKGROUND / noise_sd) ** 2).all()
+
+
+def test_flags_of_needles_at_the_edge_and_at_the_end_of_the_range() -> None:
+    """A pin that points inwards is whole; what is left out of a fit is saturated only where the film is."""
+    rng = np.random.default_rng(6)
+    film = np.clip(30000 + 300 * rng.standard_normal((400, 400)), 0, 65535).astype(np.uint16)
+    film[195:206, 320:340] = 65535
+    noise = replace(estimate_noise(film, 16), ceiling=65535.0)
+    blank = unfit(np.zeros(2), np.zeros(1), NeedleShape(3.0, 30.0))
+    told = {
+        "depth": -1e4,
+        "chi2_core": 1.0,
+        "chi2_ring": 1.0,
+        "n_core": 100,
+        "explained": 0.99,
+        "misfit": 0.01,
+        "significance": 50.0,
+        "height": 1e4,
+    }
+    fit = replace(blank, depths=np.array([-1e4]), background=3e4, covariance_px2=1e-4 * np.eye(2), **told)
+    at = {(15.0, 60.0): 1.0, (380.0, 120.0): 1.0, (300.0, 200.0): 0.9, (100.0, 300.0): 0.9, (200.0, 300.0): 0.5}
+    pins = [replace(fit, position_px=np.array(tip), valid_fraction=valid) for tip, valid in at.items()]
+    none = np.zeros(0, bool)
+    args = (1.0, np.ones(0), np.zeros((5, 2, 2)), np.zeros(5, bool), none, none, pins, np.zeros((0, 5)), Optics(1.0, 0.5), noise)
+    images, _ = table_of(film, 16, no_fits(), *args)
+    asked = MarkerFlag.EDGE | MarkerFlag.SATURATED | MarkerFlag.OVERLAP | MarkerFlag.CLIPPED
+    flags = [MarkerFlag(int(flags)) & asked for flags in images.flags[np.lexsort((images.position_px[:, 0], images.position_px[:, 1]))]]
+    covered = MarkerFlag.OVERLAP
+    assert flags == [MarkerFlag.NONE, MarkerFlag.EDGE, MarkerFlag.SATURATED, covered, covered | MarkerFlag.CLIPPED]

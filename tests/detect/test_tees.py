@@ -238,6 +238,22 @@ def test_what_is_blotted_out_beside_tees_does_not_tell_what_bone_does_to_them() 
     assert np.isfinite([f.covariance_px2 for f in fitted]).all()
 
 
+def test_needles_that_are_fitted_together_stay_in_their_order() -> None:
+    """Sets whose arms cross are fitted in one go, wherever in the list they are."""
+    rng = np.random.default_rng(3)
+    tips = tips_of(rng)
+    film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
+    noise, optics = estimate_noise(film, 16), Optics(SIGMA_PX, 0.8)
+    candidates = find_candidates(film, noise)
+    found, _, optics = find_tees(film, candidates.junctions, candidates.strokes, optics, noise)
+    beside = min(found[1:], key=lambda t: float(np.hypot(*(t.position_px - found[0].position_px))))
+    between = [t for t in found if t is not found[0] and t is not beside]
+    longer = [replace(t, shape=replace(t.shape, length_px=1.6 * t.shape.length_px)) for t in (found[0], *between[:3], beside)]
+    fitted, _ = shared.fit_shared(film, longer, optics, noise, parallel=True)
+    gap = np.hypot(*np.transpose([a.position_px - b.position_px for a, b in zip(fitted, longer, strict=True)]))
+    assert gap.max() < 2.0
+
+
 @pytest.mark.parametrize(("cnr", "pitch_mm"), [(200.0, 0.058), (50.0, 0.058), (50.0, 0.1)])
 def test_tees_alone_in_little_noise(cnr: float, pitch_mm: float) -> None:
     """What surrounds them passed for tees of the other polarity, one for two where blur was guessed, misfits of balls for noise."""

@@ -1,6 +1,7 @@
 """What is paler than a film's balls wherever they lie, told from balls that are pale because of what they lie on."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -156,6 +157,12 @@ def test_tees_among_balls_need_company() -> None:
     assert lone_tees([*two, tee(1.5, 2.5)], np.ones(3, bool)).all()
     assert lone_tees([*two, tee(0.0, 4.5)], np.ones(3, bool)).all()
     assert lone_tees(three, np.array([True, True, False])).tolist() == [True, True, False]
+    turned = [tee(turn, 2.5) for turn in (0.0, 1.0, 2.0)]
+    for explained, lone in ((0.98, True), (0.992, False)):  # more than the model explains of letters
+        assert lone_tees([replace(t, explained=explained) for t in turned], np.ones(3, bool)).all() == lone
+    closely = replace(turned[0], explained=0.996)
+    assert lone_tees([closely, turned[1]], np.ones(2, bool)).tolist() == [False, True]
+    assert lone_tees([closely], np.zeros(1, bool)).all()
 
 
 def test_a_tee_whose_place_is_known_badly_though_it_stands_high_above_noise_is_none() -> None:
