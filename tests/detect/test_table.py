@@ -102,7 +102,6 @@ def test_flags_of_needles_at_the_edge_and_at_the_end_of_the_range() -> None:
     none = np.zeros(0, bool)
     args = (1.0, np.ones(0), np.zeros((5, 2, 2)), np.zeros(5, bool), none, none, pins, np.zeros((0, 5)), Optics(1.0, 0.5), noise)
     images, _ = table_of(film, 16, no_fits(), *args)
-    asked = MarkerFlag.EDGE | MarkerFlag.SATURATED | MarkerFlag.OVERLAP | MarkerFlag.CLIPPED
+    asked = MarkerFlag.EDGE | MarkerFlag.SATURATED | MarkerFlag.CLIPPED
     flags = [MarkerFlag(int(flags)) & asked for flags in images.flags[np.lexsort((images.position_px[:, 0], images.position_px[:, 1]))]]
-    covered = MarkerFlag.OVERLAP
-    assert flags == [MarkerFlag.NONE, MarkerFlag.EDGE, MarkerFlag.SATURATED, covered, covered | MarkerFlag.CLIPPED]
+    assert flags == [MarkerFlag.NONE, MarkerFlag.EDGE, MarkerFlag.SATURATED, MarkerFlag.CLIPPED, MarkerFlag.CLIPPED]

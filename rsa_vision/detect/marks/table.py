@@ -121,7 +121,7 @@ def table_of(
     flags[edge] |= MarkerFlag.EDGE
     valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in needles]])
     for k in np.flatnonzero((valid < WHOLE) & ~edge):  # else something lies over it that is left out of the fit
-        flags[k] |= MarkerFlag.SATURATED if _at_an_end(film, low[k], high[k], noise) else MarkerFlag.OVERLAP
+        flags[k] |= MarkerFlag.SATURATED if _at_an_end(film, low[k], high[k], noise) else MarkerFlag.CLIPPED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
     flags[n:][[_noise_is_cut_off(t, noise) for t in needles]] |= MarkerFlag.SATURATED | MarkerFlag.CLIPPED
     flags[touching] |= MarkerFlag.OVERLAP
