@@ -24,12 +24,13 @@ from rsa_vision.detect.needles.first_pins import MOST_STROKES, look_for_pins
 from rsa_vision.detect.search.candidates import STRENGTH, find_candidates
 from rsa_vision.detect.search.strokes import at_junctions
 from rsa_vision.errors import FilmFormatError
-from rsa_vision.images.header import MAX_BITS, MIN_BITS, MIN_SIDE_PX
+from rsa_vision.images.header import MAX_BITS, MIN_BITS
 from rsa_vision.threads import in_one_thread
 from rsa_vision.types import MarkerImages
 
 __all__ = ["Detection", "detect_markers"]
 
+_LEAST_PX = 16  # of a side; cuttings of films are welcome, but noise is told by tiles
 _BEYOND = 4.0  # times what first looks show of the other polarity: marks that are found leave it no chance
 
 
@@ -61,7 +62,7 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     Parameters
     ----------
     values : ndarray of shape (rows, cols)
-        uint8 or uint16, of either byte order, at least 64 a side.
+        uint8 or uint16, of either byte order, at least 16 a side.
     bits : int
         Significant bits, 8 to 16.
     response : str
@@ -96,8 +97,8 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
 def _film_values(values: NDArray[Any], bits: int) -> NDArray[Any]:
     """Return the values in the byte order of the machine, or refuse what is no film."""
     values = np.asarray(values)
-    if values.ndim != 2 or min(values.shape) < MIN_SIDE_PX:
-        raise FilmFormatError(f"an array of shape {values.shape} is no film; give one of (rows, cols), at least {MIN_SIDE_PX} a side")
+    if values.ndim != 2 or min(values.shape) < _LEAST_PX:
+        raise FilmFormatError(f"an array of shape {values.shape} is no film; give one of (rows, cols), at least {_LEAST_PX} a side")
     if values.dtype.kind != "u" or values.dtype.itemsize > 2:
         raise FilmFormatError(f"values of type {values.dtype} are no film; scale them to the integers of 8 to 16 bits, as uint8 or uint16")
     if not MIN_BITS <= bits <= MAX_BITS:

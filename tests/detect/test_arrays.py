@@ -24,7 +24,7 @@ FILM = np.random.default_rng(0).normal(30000 - 15000 * sum(BALLS), 100).astype(n
         (np.full(FILM.shape, np.nan), 16, "as uint8 or uint16"),
         (FILM > 20000, 8, "as uint8 or uint16"),
         (np.dstack([FILM] * 3), 16, "(rows, cols)"),
-        (FILM[:7, :7], 16, "at least 64 a side"),
+        (FILM[:7, :7], 16, "at least 16 a side"),
         (FILM, -1, "8 to 16"),
         (FILM, 17, "8 to 16"),
         (FILM, 12, "number of bits"),
