@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rsa_vision.errors import FilmError, UsageError
 from rsa_vision.preparation import settle
 from rsa_vision.store import check_target, parquet_bytes, to_csv, write_atomic
-from rsa_vision.study_files import is_utf8
+from rsa_vision.study_files import is_utf8, printable
 
 if TYPE_CHECKING:
     import polars as pl
@@ -100,7 +100,7 @@ def _read(path: Path) -> Film:
     from rsa_vision.images import read_film
 
     if not is_utf8(str(path)):
-        raise FilmError(f"{path}: the name is no UTF-8, and tables could not say it; rename the file")
+        raise FilmError(f"{printable(str(path))}: the name is no UTF-8, and tables could not say it; rename the file")
     return read_film(path)
 
 

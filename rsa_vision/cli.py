@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -76,7 +77,7 @@ def run_app(arguments: list[str]) -> int:
     except (Exception, SystemExit) as error:
         # typer makes an exit of a broken pipe by itself
         refused = error.__context__ if isinstance(error, SystemExit) else error
-        if isinstance(refused, OSError) and refused.filename is None:
+        if isinstance(refused, OSError) and refused.filename is None and refused.errno in (errno.EPIPE, errno.ENOSPC, errno.EIO):
             return _unprinted(refused)
         # a usage error of typer knows how to show itself, and its exit code
         show, exit_code = getattr(error, "show", None), getattr(error, "exit_code", None)
@@ -86,7 +87,7 @@ def run_app(arguments: list[str]) -> int:
         show()
         return int(exit_code)
     if code == INTERRUPTED:  # typer makes an exit code of Ctrl-C by itself
-        _complain(f"stopped; {LEFT.get(arguments[0], 'each file is the old or the new one, whole')}")
+        _complain(f"stopped; {LEFT.get(''.join(arguments[:1]), 'each file is the old or the new one, whole')}")
     return code
 
 
