@@ -311,17 +311,21 @@ def _span(marks: Any) -> str:
 
 
 def _print_summary(summary: Summary) -> None:
+    from rsa_vision.study_files import printable
+
     for outcome in summary.outcomes:
         if outcome.status != "ok":
             message = outcome.rows["exams"][0].get("message") or ""
-            print(f"{_name(outcome)}: {outcome.status} ({outcome.reasons}): {message}")
+            print(printable(f"{_name(outcome)}: {outcome.status} ({outcome.reasons}): {message}"))
     n = len(summary.outcomes)
     counts = ", ".join(f"{summary.count(status)} {status}" for status in ("ok", "review", "failed"))
     print(f"{n} examination{'s' if n != 1 else ''}: {counts} -> {summary.out / 'report.html'}")
 
 
 def _name(outcome: Outcome) -> str:
-    return f"{outcome.subject} {outcome.exam}".strip()
+    from rsa_vision.study_files import printable
+
+    return printable(f"{outcome.subject} {outcome.exam}".strip())
 
 
 @contextmanager
