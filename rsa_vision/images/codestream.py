@@ -18,6 +18,7 @@ JPEG_LS: Final = 0xF7  # its SOF
 _FRAMES: Final = frozenset({*range(0xC0, 0xD0), JPEG_LS}) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC; JPEG-LS
 _BARE: Final = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
 _PROGRESSIVE: Final = 0xC2
+_HUFFMAN: Final = (0xC0, 0xC1, _PROGRESSIVE, 0xC3)
 _RUN_END: Final = re.compile(rb"\xff+[\xd0-\xd7]")  # RST0..7
 _MORE: Final = bytes(range(1, 65))
 _LAST: Final = 4  # bytes; what fewer of them say may be lost in rounding
@@ -117,6 +118,8 @@ def decoded(data: bytes, stream: Stream, decode: Callable[[bytes], NDArray[Any]]
         The image of ``data``.
     """
     image = decode(data)
+    if stream.kind not in _HUFFMAN:  # arithmetic decoders read on, and what they read counts
+        return image
 
     def same(coded: bytes) -> bool:
         try:
