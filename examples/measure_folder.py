@@ -30,4 +30,8 @@ def main(folder: str, out: str, cage: str | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    try:
+        sys.exit(main(*sys.argv[1:]))
+    except rsa_vision.RsaError as error:  # its message says what to do
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)

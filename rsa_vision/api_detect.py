@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import count
+from os import PathLike
+from os.path import realpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsa_vision.errors import FilmError, UsageError
 from rsa_vision.preparation import settle
-from rsa_vision.store import parquet_bytes, to_csv, write_atomic
+from rsa_vision.store import check_target, parquet_bytes, to_csv, write_atomic
+from rsa_vision.study_files import is_utf8, printable
 
 if TYPE_CHECKING:
     import polars as pl
 
+    from rsa_vision.types import Film
+
 
 def detect(
-    images: Sequence[str | Path],
+    images: str | Path | Sequence[str | Path],
     out: str | Path | None = None,
     *,
     overlay: str | Path | None = None,
@@ -27,13 +33,13 @@ def detect(
 
     Parameters
     ----------
-    images : sequence of path
+    images : path or sequence of path
     out : path, optional
-        File for the result: Parquet where it ends in ``.parquet``, else CSV.
+        File for the result, ``.csv`` or ``.parquet``. Where no film can be used it is not written, and an older one is left as it was.
     overlay : path, optional
         PNG file for a drawing; with several images the name of each is added to it, and a number where names are the same.
     response : str
-        Film response, as in the study file.
+        Film response, as in the study file. Nothing depends on it here: the film itself tells.
     failures : list, optional
         Films that cannot be used are added to it as (path, message); without it the first one is raised.
     watch : callable, optional
@@ -51,59 +57,75 @@ def detect(
     SettingsError
         If the response is unknown.
     UsageError
-        If no image is given, or a result cannot be written or would take the place of a film or of another result.
+        If no image is given, or a result cannot be written, has the ending of another kind of file, or would take the place of a film.
     """
     from rsa_vision.detect import detect_markers
-    from rsa_vision.images import read_film
     from rsa_vision.overlay import overlay_png
     from rsa_vision.tables import DETECTIONS, detection_rows, frame
 
-    if not images:
+    names = [images] if isinstance(images, str | PathLike) else images
+    films = [Path(name) for name in names]
+    if not films:
         raise UsageError("no image given; name the films to look at")
     settle(None, {"response": response})  # refuses an unknown one
-    drawings = [] if overlay is None else _overlay_paths(Path(overlay), [Path(name) for name in images])
-    _check_targets(([] if out is None else [Path(out)]) + drawings, [Path(name) for name in images])
+    drawings = [] if overlay is None else _overlay_paths(Path(overlay), films)
+    _check_targets([] if out is None else [Path(out)], "-o", (".csv", ".parquet"), films)
+    _check_targets(drawings, "--overlay", (".png",), films)
     rows: list[dict[str, Any]] = []
-    for number, name in enumerate(images):
+    usable = 0
+    for number, path in enumerate(films):
         try:
-            film = read_film(Path(name))
+            film = _read(path)
             found = detect_markers(film.values, bits=film.bits, response=response).images
         except FilmError as error:
             if failures is None:
                 raise
-            failures.append((Path(name), str(error)))
+            failures.append((path, str(error)))
             if watch:
-                watch(Path(name), -1)
+                watch(path, -1)
             continue
-        rows += detection_rows(str(name), found)
+        usable += 1
+        rows += detection_rows(str(names[number]), found)
         if drawings:
-            write_atomic(drawings[number], overlay_png(film.values, found))
+            write_atomic(drawings[number], overlay_png(film.values, found), "--overlay")
         if watch:
-            watch(Path(name), len(found))
+            watch(path, len(found))
     table = frame(rows, DETECTIONS)
-    if out is not None:
-        write_atomic(Path(out), parquet_bytes(table) if Path(out).suffix == ".parquet" else to_csv(table))
+    if out is not None and usable:
+        write_atomic(Path(out), parquet_bytes(table) if Path(out).suffix.lower() == ".parquet" else to_csv(table))
     return table
+
+
+def _read(path: Path) -> Film:
+    from rsa_vision.images import read_film
+
+    if not is_utf8(str(path)):
+        raise FilmError(f"{printable(str(path))}: the name is no UTF-8, and tables could not say it; rename the file")
+    return read_film(path)
 
 
 def _overlay_paths(overlay: Path, images: Sequence[Path]) -> list[Path]:
     """One for each image, told apart by the image's name, and by a number where names are the same."""
     if len(images) == 1:
         return [overlay]
-    stems = [f"{overlay.stem}_{image.stem}" for image in images]
-    numbers = [f"_{stems[:k].count(stem) + 1}" if stems.count(stem) > 1 else "" for k, stem in enumerate(stems)]
-    return [overlay.with_name(f"{stem}{number}{overlay.suffix or '.png'}") for stem, number in zip(stems, numbers, strict=True)]
+    stems = [image.stem for image in images]
+    taken = {stem for stem in stems if stems.count(stem) == 1}
+    paths = []
+    for stem in stems:
+        name = stem
+        if stems.count(stem) > 1:
+            name = next(numbered for k in count(1) if (numbered := f"{stem}_{k}") not in taken)
+            taken.add(name)
+        paths.append(overlay.with_name(f"{overlay.stem}_{name}{overlay.suffix or '.png'}"))
+    return paths
 
 
-def _check_targets(targets: Sequence[Path], images: Sequence[Path]) -> None:
-    """Refuse, before any work is done, results that would take the place of a film, of each other or of a folder."""
-    films, taken = {image.resolve() for image in images}, set[Path]()
+def _check_targets(targets: Sequence[Path], option: str, endings: Sequence[str], images: Sequence[Path]) -> None:
+    """Refuse, before any work is done, results that would take the place of a film or cannot be written."""
+    films = {realpath(image) for image in images}
     for target in targets:
-        place = target.resolve()
-        if place in films:
-            raise UsageError(f"{target}: is one of the films, which the result would overwrite; choose another name")
-        if place in taken:
-            raise UsageError(f"{target}: two results of one name; choose another for the drawing")
-        if place.is_dir():
-            raise UsageError(f"{target}: is a folder; name a file in it")
-        taken.add(place)
+        if realpath(target) in films:
+            raise UsageError(f"{target}: is one of the films, which the result would overwrite; choose another name with {option}")
+        check_target(target, option)
+        if target.suffix.lower() not in endings:
+            raise UsageError(f"{target}: no file of this kind is written; with {option}, name a file that ends in {' or '.join(endings)}")

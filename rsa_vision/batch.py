@@ -14,6 +14,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from rsa_vision.errors import FilmError, RsaError, UsageError
+from rsa_vision.images import check_file
 from rsa_vision.provenance import file_sha256, version
 from rsa_vision.settings import Study
 from rsa_vision.store import fingerprint, is_finished, read_record, record_path, write_record
@@ -128,8 +129,8 @@ def measure_task(task: Task) -> Outcome:
     path = record_path(task.out, files.subject, files.exam)
     inputs: dict[str, str] = {}
     try:
-        if strange := [film.path for film in files.films if film.path.exists() and not film.path.is_file()]:
-            raise FilmError(f"{strange[0]}: a pipe or a device, whose reading may never end; copy the film into the folder")
+        for film in files.films:
+            check_file(film.path)
         inputs = {film.path.name: file_sha256(film.path) for film in files.films}
         wanted = fingerprint({**task.depends_on, "version": version(), "exam": [files.subject, files.exam], "films": inputs})
         record = read_record(path)
@@ -141,7 +142,9 @@ def measure_task(task: Task) -> Outcome:
     except RsaError as error:
         return _failed(files, error.code, str(error), started, inputs)
     except OSError as error:
-        return _failed(files, FilmError.code, f"{error.filename}: cannot be read ({error.strerror})", started, inputs)
+        return _failed(
+            files, FilmError.code, f"{error.filename}: cannot be read ({error.strerror}); look at its path and permissions", started, inputs
+        )
     except MemoryError:
         return _failed(files, "internal", "not enough memory; run fewer --jobs", started, inputs, traceback.format_exc())
     except Exception as error:  # one examination never stops a run; the trace is kept in run.json

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
 
@@ -33,7 +34,12 @@ app.add_typer(segments_app, name="segments")
 cli_motion.register(app)
 
 INTERRUPTED = 130  # as shells report Ctrl-C
-Result = TypeVar("Result")
+LEFT: Final = {
+    "measure": "the same command goes on with what is left",
+    "demo": "the same command goes on with what is left",
+    "detect": "its table is written at the end: an older one is as it was",
+}
+"""What a command leaves that was stopped."""
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
 CageOption = Annotated[str | None, typer.Option("--cage", help="Built-in cage or cage file; `rsa-vision cage list` shows them.")]
@@ -42,7 +48,18 @@ StudyOption = Annotated[Path | None, typer.Option("--study", help="Study file.")
 
 def main() -> NoReturn:
     """Run the command line; expected failures become one message and their exit code, never a traceback."""
+    _steady_streams()
     sys.exit(run_app(sys.argv[1:]))
+
+
+def _steady_streams() -> None:
+    """Let closed streams lead nowhere, and what an encoding lacks be printed as escapes: neither is to cost a result."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+        else:
+            stream.reconfigure(errors="backslashreplace")
 
 
 def run_app(arguments: list[str]) -> int:
@@ -55,12 +72,13 @@ def run_app(arguments: list[str]) -> int:
     except RsaError as error:
         _complain(str(error))
         return error.exit_code
-    except BrokenPipeError:  # the reader of a pipe has gone: nobody to tell
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        # typer makes an exit of a broken pipe by itself
+        refused = error.__context__ if isinstance(error, SystemExit) else error
+        if isinstance(refused, OSError) and refused.filename is None and refused.errno in (errno.EPIPE, errno.ENOSPC, errno.EIO):
+            return _unprinted(refused)
         # a usage error of typer knows how to show itself, and its exit code
         show, exit_code = getattr(error, "show", None), getattr(error, "exit_code", None)
         if show is None or exit_code is None:
@@ -69,8 +87,17 @@ def run_app(arguments: list[str]) -> int:
         show()
         return int(exit_code)
     if code == INTERRUPTED:  # typer makes an exit code of Ctrl-C by itself
-        _complain("stopped; the same command goes on with what is left")
+        _complain(f"stopped; {LEFT.get(''.join(arguments[:1]), 'each file is the old or the new one, whole')}")
     return code
+
+
+def _unprinted(error: OSError) -> int:
+    """Return the exit code where standard output takes no more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails again at its end
+    if isinstance(error, BrokenPipeError):  # the reader of a pipe has gone: nobody to tell
+        return 0
+    _complain(f"standard output cannot be written ({error.strerror}); send it to another place")
+    return 2
 
 
 def _show_version(wanted: bool) -> None:
@@ -140,26 +167,35 @@ def measure(
 
 @app.command()
 def detect(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Films.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="File for the result: CSV, or Parquet (.parquet).")],
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Films.", readable=False)],  # that fails for its film alone
+    out: Annotated[Path, typer.Option("--out", "-o", help="File for the result: .csv or .parquet.")],
     overlay: Annotated[Path | None, typer.Option("--overlay", help="PNG file for a drawing of what was found.")] = None,
-    response: Annotated[str, typer.Option("--response", help="auto, density, transmission, linear or log.")] = "auto",
+    response: Annotated[
+        str, typer.Option("--response", help="auto, density, transmission, linear or log; nothing depends on it: the film tells.")
+    ] = "auto",
 ) -> int:
     """Find the marker images of single films: balls, pins and tees."""
     from rsa_vision import api
+    from rsa_vision.study_files import printable
 
     failures: list[tuple[Path, str]] = []
+    blank: list[str] = []
+
+    def watch(path: Path, found: int) -> None:
+        name = printable(str(path))
+        if found == 0:
+            blank.append(name)
+        tell(f"{name}: {found} marker images" if found >= 0 else f"{name}: failed")
+
     with _counter(len(images)) as tell:
-        table = api.detect(
-            images,
-            out,
-            overlay=overlay,
-            response=response,
-            failures=failures,
-            watch=lambda path, found: tell(f"{path}: {found} marker images" if found >= 0 else f"{path}: failed"),
-        )
+        table = api.detect(images, out, overlay=overlay, response=response, failures=failures, watch=watch)
     for _, message in failures:
-        _complain(message)
+        _complain(printable(message))
+    if blank:  # the table does not name them
+        _complain(f"no marker image on {', '.join(blank)}")
+    if len(failures) == len(images):
+        _complain(f"no film could be used: {out} is not written, and an older one is as it was")
+        return 1
     print(f"{len(table)} marker images on {len(images) - len(failures)} films -> {out}")
     return 1 if failures else 0
 
@@ -275,17 +311,21 @@ def _span(marks: Any) -> str:
 
 
 def _print_summary(summary: Summary) -> None:
+    from rsa_vision.study_files import printable
+
     for outcome in summary.outcomes:
         if outcome.status != "ok":
             message = outcome.rows["exams"][0].get("message") or ""
-            print(f"{_name(outcome)}: {outcome.status} ({outcome.reasons}): {message}")
+            print(printable(f"{_name(outcome)}: {outcome.status} ({outcome.reasons}): {message}"))
     n = len(summary.outcomes)
     counts = ", ".join(f"{summary.count(status)} {status}" for status in ("ok", "review", "failed"))
     print(f"{n} examination{'s' if n != 1 else ''}: {counts} -> {summary.out / 'report.html'}")
 
 
 def _name(outcome: Outcome) -> str:
-    return f"{outcome.subject} {outcome.exam}".strip()
+    from rsa_vision.study_files import printable
+
+    return printable(f"{outcome.subject} {outcome.exam}".strip())
 
 
 @contextmanager
@@ -331,7 +371,10 @@ def _bar() -> Any:
 
 
 def _complain(message: str) -> None:
-    print(f"rsa-vision: {message}", file=sys.stderr)
+    from rsa_vision.study_files import printable
+
+    lines = map(printable, message.split("\n"))  # some messages are lists
+    print("rsa-vision:", "\n".join(lines), file=sys.stderr)
 
 
 if __name__ == "__main__":

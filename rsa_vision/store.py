@@ -12,8 +12,10 @@ import io
 import json
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,37 +28,59 @@ RETRIED: Final = frozenset({"internal", "timeout"})
 """Reasons that tell nothing about the films: such an examination counts as not finished."""
 
 
-def write_atomic(path: Path, content: bytes) -> None:
+def write_atomic(path: Path, content: bytes, option: str = "-o") -> None:
     """Write a file under a temporary name and move it into place: a kill leaves the old or the new one, whole.
 
     Parameters
     ----------
     path : Path
+        A link is followed: what it points to is replaced.
     content : bytes
+    option : str
+        The option that names the file, for the message.
 
     Raises
     ------
     UsageError
-        If it cannot be written.
+        If it cannot be written, or is there and no regular file.
     """
+    temporary = _temporary(path, option)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another place with -o") from error
-    try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        Path(temporary).chmod(0o666 & ~_umask())
-        Path(temporary).replace(path)
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(os.path.realpath(path))
     except OSError as error:
-        Path(temporary).unlink(missing_ok=True)
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); make room or choose another place with -o") from error
+        temporary.unlink(missing_ok=True)
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); make room or choose another place with {option}") from error
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
+
+
+def check_target(path: Path, option: str = "-o") -> None:
+    """Raise what :func:`write_atomic` would, but for want of room: to be asked before the work is done that it is to write."""
+    _temporary(path, option).unlink()
+
+
+def _temporary(path: Path, option: str) -> Path:
+    """Return a new file beside the one to be written."""
+    target = Path(os.path.realpath(path))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):
+            kind = target.stat().st_mode
+            if stat.S_ISDIR(kind):
+                raise UsageError(f"{path}: is a folder; name a file in it")
+            if not stat.S_ISREG(kind):
+                raise UsageError(f"{path}: is no regular file; choose another place with {option}")
+        handle, temporary = tempfile.mkstemp(prefix=".", suffix=".part", dir=target.parent)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another place with {option}") from error
+    os.close(handle)
+    return Path(temporary)
 
 
 def _umask() -> int:

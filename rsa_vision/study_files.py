@@ -17,6 +17,8 @@ FILM_SUFFIXES: Final = frozenset({".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp
 NAME_RULE: Final = re.compile(
     r"(?P<subject>.+)_(?!f\d+(?:_|$)|cage(?:_|$))(?P<exam>[^_]+)(?:_f(?P<focus>\d+))?(?P<cage>_cage)?", re.IGNORECASE
 )
+_NO_UTF8: Final = re.compile("[\ud800-\udfff]")  # as Python decodes them
+_UNPRINTABLE: Final = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")  # what ends lines or steers terminals
 Tags = Mapping[str, str]
 TagReader = Callable[[Path], Tags | None]
 
@@ -48,9 +50,14 @@ class Grouping:
     ignored: tuple[tuple[Path, str], ...]
 
 
-def printable(name: str) -> str:
-    r"""Return a file name as it can be printed and written: bytes that are no UTF-8 as ``\udcff``."""
-    return name.encode("utf-8", "backslashreplace").decode("utf-8")
+def printable(text: str) -> str:
+    r"""Return a text, as of a file name, that can be printed: control characters and bytes that are no UTF-8 as ``\x1b``, ``\udcff``."""
+    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def is_utf8(name: str) -> bool:
+    """Tell whether a file name is UTF-8; tables cannot say another."""
+    return not _NO_UTF8.search(name)
 
 
 def compile_pattern(pattern: str | None) -> re.Pattern[str] | None:
@@ -136,8 +143,8 @@ def group_films(
     grouped: dict[tuple[str, str], list[FilmFile]] = {}
     unnamed: list[ExamFiles] = []
     for path in films:
-        if (shown := printable(path.name)) != path.name:
-            problem = "film-name", f"{shown}: the name is no UTF-8, and tables could not say it; rename the file"
+        if not is_utf8(path.name):
+            problem = "film-name", f"{printable(path.name)}: the name is no UTF-8, and tables could not say it; rename the file"
             unnamed.append(ExamFiles(printable(path.stem), "", (FilmFile(path, None),), problem))
             continue
         named = _name(path, pattern) or _name_by_tags(tags_of(path) or {}, path)

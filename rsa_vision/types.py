@@ -77,7 +77,8 @@ class MarkerImages(Table):
         Pin: direction from the tip to the thick end. Tee: direction of the stem (the arm without an opposite). Counter-clockwise from +col
         as displayed (row down): ``atan2(-drow, dcol)``. NaN for balls.
     contrast : ndarray of shape (n,)
-        Fitted depth of the image, as a part of the film's full scale; positive for either polarity.
+        Fitted amplitude, as a part of the film's full scale, positive for either polarity: the depth of the image without blur at full
+        opacity. Of marks that are small against the blur less is seen, and it may exceed 1.
     background : ndarray of shape (n,)
         What the film would be there without the mark, as a part of its full scale; NaN where not known.
     snr : ndarray of shape (n,)

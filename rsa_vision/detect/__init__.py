@@ -23,11 +23,14 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.first_pins import MOST_STROKES, look_for_pins
 from rsa_vision.detect.search.candidates import STRENGTH, find_candidates
 from rsa_vision.detect.search.strokes import at_junctions
+from rsa_vision.errors import FilmFormatError
+from rsa_vision.images.header import MAX_BITS, MIN_BITS
 from rsa_vision.threads import in_one_thread
 from rsa_vision.types import MarkerImages
 
 __all__ = ["Detection", "detect_markers"]
 
+_LEAST_PX = 16  # of a side; cuttings of films are welcome, but noise is told by tiles
 _BEYOND = 4.0  # times what first looks show of the other polarity: marks that are found leave it no chance
 
 
@@ -59,9 +62,9 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     Parameters
     ----------
     values : ndarray of shape (rows, cols)
-        uint8 or uint16.
+        uint8 or uint16, of either byte order, at least 16 a side.
     bits : int
-        Significant bits.
+        Significant bits, 8 to 16.
     response : str
         ``auto``, ``density``, ``transmission``, ``linear`` or ``log``. The model takes the bend of the response from the film (it shows in
         the profiles as more or less attenuation), so this is a statement about the film, not a switch; it is kept for ``run.json``.
@@ -71,7 +74,13 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     Returns
     -------
     Detection
+
+    Raises
+    ------
+    FilmFormatError
+        If the values are no film: of another type or shape, fewer, or beyond the bits.
     """
+    values = _film_values(values, bits)
     limit = significance_limit(values.size, false_detections)
     noise = estimate_noise(values, bits)
     found = _detect(values, bits, noise, limit)
@@ -83,6 +92,20 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
     doubted = of_doubtful_polarity(chosen.images) if contested else chosen.images
     height = height_of_waves(values, noise.floor, noise.ceiling) / (2**bits - 1)
     return replace(chosen, images=like_waves(doubted, height, chosen.optics))
+
+
+def _film_values(values: NDArray[Any], bits: int) -> NDArray[Any]:
+    """Return the values in the byte order of the machine, or refuse what is no film."""
+    values = np.asarray(values)
+    if values.ndim != 2 or min(values.shape) < _LEAST_PX:
+        raise FilmFormatError(f"an array of shape {values.shape} is no film; give one of (rows, cols), at least {_LEAST_PX} a side")
+    if values.dtype.kind != "u" or values.dtype.itemsize > 2:
+        raise FilmFormatError(f"values of type {values.dtype} are no film; scale them to the integers of 8 to 16 bits, as uint8 or uint16")
+    if not MIN_BITS <= bits <= MAX_BITS:
+        raise FilmFormatError(f"{bits} bits; films have {MIN_BITS} to {MAX_BITS}")
+    if int(values.max()) >= 2**bits:
+        raise FilmFormatError(f"values beyond {bits} bits; give the number of bits that the film has")
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
 def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, only: int | None = None) -> list[tuple[float, Detection]]:

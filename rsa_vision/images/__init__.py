@@ -2,6 +2,6 @@
 
 from rsa_vision.images.header import Header
 from rsa_vision.images.pitch import require_pitch
-from rsa_vision.images.reader import open_header, read_film
+from rsa_vision.images.reader import check_file, open_header, read_film
 
-__all__ = ["Header", "open_header", "read_film", "require_pitch"]
+__all__ = ["Header", "check_file", "open_header", "read_film", "require_pitch"]

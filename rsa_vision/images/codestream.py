@@ -5,12 +5,24 @@ The marker layout is that of ISO 10918-1 annex B (JPEG), ISO 14495-1 annex C (JP
 
 from __future__ import annotations
 
+import re
 import struct
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 END: Final = b"\xff\xd9"  # EOI of JPEG and JPEG-LS, EOC of JPEG 2000
-_FRAMES: Final = frozenset({*range(0xC0, 0xD0), 0xF7}) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC; JPEG-LS
+JPEG_LS: Final = 0xF7  # its SOF
+_FRAMES: Final = frozenset({*range(0xC0, 0xD0), JPEG_LS}) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC; JPEG-LS
 _BARE: Final = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
+_PROGRESSIVE: Final = 0xC2
+_HUFFMAN: Final = (0xC0, 0xC1, _PROGRESSIVE, 0xC3)
+_RUN_END: Final = re.compile(rb"\xff+[\xd0-\xd7]")  # RST0..7
+_MORE: Final = bytes(range(1, 65))
+_LAST: Final = 4  # bytes; what fewer of them say may be lost in rounding
+_OTHERS: Final = (0x55, 0xAA, 0x36, 0xC9, 0x0F, 0xF0)  # many: a saturated corner may look the same with some of them
 
 
 class Stream(NamedTuple):
@@ -84,3 +96,45 @@ def ends(data: bytes, scan: int, padding: int | None = None) -> bool:
     """
     last = data.rfind(END, scan)
     return last >= 0 and (padding is None or len(data) - last - len(END) <= padding)
+
+
+def decoded(data: bytes, stream: Stream, decode: Callable[[bytes], NDArray[Any]]) -> NDArray[Any]:
+    """Decode a JPEG stream that has its end; ValueError if it holds fewer or more coded bits than its image takes.
+
+    Damage puts a decoder out of step, and it says nothing: it fills up what is missing with grey, or passes over what is left. Then more
+    bits before an end change the image, or other last bits do not. Damage after which the count is right by chance is not found.
+
+    Parameters
+    ----------
+    data : bytes
+    stream : Stream
+        Its header.
+    decode : callable
+        Returns the image of a stream.
+
+    Returns
+    -------
+    ndarray
+        The image of ``data``.
+    """
+    image = decode(data)
+    if stream.kind not in _HUFFMAN:  # arithmetic decoders read on, and what they read counts
+        return image
+
+    def same(coded: bytes) -> bool:
+        try:
+            return np.array_equal(decode(data[: stream.scan] + coded + data[stop:]), image)
+        except Exception:  # decoders do not say what they may throw
+            return False
+
+    stop = data.find(END, stream.scan) % (len(data) + 1)  # at the end of the data, where there is none
+    coded = data[stream.scan : stop]
+    if not same(_RUN_END.sub(lambda end: _MORE + end[0], coded) + _MORE):
+        raise ValueError("coded bits are missing")
+    # where the last bits are of what rounding or the margin may hide, this cannot be asked
+    if stream.kind != _PROGRESSIVE and stream.samples == 1 and not _RUN_END.search(coded):
+        last = _LAST - coded.startswith(b"\xff\0", len(coded) - _LAST - 1)  # a zero is stuffed behind it
+        unused = all(same(coded[:-last] + bytes([other]) * last) for other in _OTHERS)
+        if unused and not same(bytes(_OTHERS) * (len(coded) // len(_OTHERS))):  # of an even film all bits may be changed
+            raise ValueError("coded bits are left over")
+    return image

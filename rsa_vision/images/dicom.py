@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.errors import FilmError, FilmFormatError
-from rsa_vision.images.codestream import ends, jpeg2000_stream, jpeg_stream
+from rsa_vision.images.codestream import decoded, ends, jpeg2000_stream, jpeg_stream
 from rsa_vision.images.grey import Pixels, to_grey
 from rsa_vision.images.header import MIN_BITS, Header
 from rsa_vision.images.pitch import Pitch, judge_pitch
@@ -23,6 +23,7 @@ _JPEG: Final = tuple(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 57, 
 _JPEG_LS: Final = _JPEG[-2:]
 _JPEG2000: Final = tuple(f"1.2.840.10008.1.2.4.{number}" for number in (90, 91))
 _RLE: Final = "1.2.840.10008.1.2.5"
+_PIXEL_DATA: Final = b"\xe0\x7f\x10\x00"  # its tag; what is encapsulated is little-endian
 _END_PADDING: Final = 16  # fragments are padded to even length; some writers pad to words
 _MONOCHROME: Final = ("MONOCHROME1", "MONOCHROME2")
 _PITCH_TAGS: Final = ("ImagerPixelSpacing", "NominalScannedPixelSpacing", "PixelSpacing")  # at the detector first
@@ -79,6 +80,8 @@ def pixels(path: Path, header: Header) -> tuple[Pixels, int]:
 
     ds = pydicom.dcmread(path, force=True)
     if "PixelData" not in ds:
+        if _has_begun(path):
+            raise FilmError(f"{path}: the coded image has no end; the file is truncated, copy it again")
         raise FilmFormatError(f"{path}: no integer pixel data; export the film itself, as 16-bit grey")
     raw = _native(ds, header) if header.meta["transfer_syntax"] in _NATIVE else _decoded(ds, header)
     photometric = header.meta.get("photometric", "MONOCHROME2")
@@ -90,6 +93,15 @@ def pixels(path: Path, header: Header) -> tuple[Pixels, int]:
         return to_grey(raw, header.bits, path)
     values, bits = _significant(raw, header.bits, shift, signed, path)
     return to_grey(values, bits, path, inverted=(photometric == "MONOCHROME1") != falling)
+
+
+def _has_begun(path: Path) -> bool:
+    """Tell whether PixelData begins in a file: pydicom drops, without a word, what is encapsulated and has no end."""
+    import pydicom
+
+    with path.open("rb") as file:
+        pydicom.dcmread(file, force=True, stop_before_pixels=True)
+        return file.read(4) == _PIXEL_DATA
 
 
 def _native(ds: Any, header: Header) -> NDArray[Any]:
@@ -133,18 +145,15 @@ def _decoded(ds: Any, header: Header) -> NDArray[Any]:
         if header.samples == 1:
             import imagecodecs  # GDCM takes three times its memory, and has no JPEG of 12 bits
 
-            decode = (
-                imagecodecs.jpegls_decode
-                if syntax in _JPEG_LS
-                else imagecodecs.jpeg_decode
-                if syntax in _JPEG
-                else imagecodecs.jpeg2k_decode
-            )
-            grey: NDArray[Any] = decode(coded)
+            if syntax in _JPEG and syntax not in _JPEG_LS:
+                return decoded(coded, stream, imagecodecs.jpeg_decode)
+            grey: NDArray[Any] = (imagecodecs.jpegls_decode if syntax in _JPEG_LS else imagecodecs.jpeg2k_decode)(coded)
             return grey
-    values, _ = get_decoder(syntax).as_array(ds, index=0)
-    decoded: NDArray[Any] = values
-    return decoded
+    try:
+        values: NDArray[Any] = get_decoder(syntax).as_array(ds, index=0)[0]
+    except RuntimeError as error:  # it names the plugins that were tried
+        raise FilmError(f"{path}: the coded image cannot be decoded; the file is damaged or truncated, copy or export it again") from error
+    return values
 
 
 def _significant(raw: NDArray[Any], bits: int, shift: int, signed: bool, path: Path) -> tuple[NDArray[Any], int]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.errors import FilmError, FilmFormatError
-from rsa_vision.images.codestream import Stream, ends, jpeg2000_stream, jpeg_stream
+from rsa_vision.images.codestream import JPEG_LS, Stream, decoded, ends, jpeg2000_stream, jpeg_stream
 from rsa_vision.images.grey import Pixels, to_grey
 from rsa_vision.images.header import Header
 from rsa_vision.images.pitch import MM_PER_INCH, Pitch, judge_pitch
@@ -81,8 +81,8 @@ def jpeg_pixels(path: Path, header: Header) -> tuple[Pixels, int]:
         raise FilmError(f"{path}: the JPEG stream has no end; the file is truncated, copy it again")
     if stream.samples == 4:
         raise FilmFormatError(f"{path}: a colour image (CMYK); export it again as grey")
-    decode = imagecodecs.jpegls_decode if stream.kind == 0xF7 else imagecodecs.jpeg_decode
-    return to_grey(decode(data), header.bits, path)
+    values = imagecodecs.jpegls_decode(data) if stream.kind == JPEG_LS else decoded(data, stream, imagecodecs.jpeg_decode)
+    return to_grey(values, header.bits, path)
 
 
 def _boxes(data: bytes, start: int, stop: int) -> Iterator[tuple[bytes, int, int]]:

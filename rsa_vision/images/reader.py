@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -85,7 +86,16 @@ def read_film(path: Path) -> Film:
     return _guarded(path, read)
 
 
+def check_file(path: Path) -> None:
+    """Raise :class:`FilmError` for what is there and is no file: reading a pipe may never end."""
+    if path.is_dir():
+        raise FilmError(f"{path}: a folder; name the films in it")
+    if path.exists() and not path.is_file():
+        raise FilmError(f"{path}: a pipe or a device, whose reading may never end; give a copy of the film as a regular file")
+
+
 def _reader(path: Path) -> Reader:
+    check_file(path)
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     if not head:
@@ -110,6 +120,8 @@ def _guarded(path: Path, read: Callable[[], Result]) -> Result:
         raise FilmError(f"{path}: cannot be read ({error.strerror or error}); look at its path and permissions") from error
     except MemoryError as error:
         raise FilmError(f"{path}: not enough memory to read it; run fewer --jobs") from error
+    except struct.error as error:
+        raise FilmError(f"{path}: ends within its header; the file is truncated, copy it again") from error
     except Exception as error:
-        detail = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+        detail = "".join(str(error).splitlines()[:1])[:200]
         raise FilmError(f"{path}: damaged or truncated ({detail}); copy or export it again") from error

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from rsa_vision.errors import FilmError, FilmFormatError
+from rsa_vision.images.codestream import decoded, jpeg_stream
 from rsa_vision.images.grey import Pixels, to_grey
 from rsa_vision.images.header import Header
 from rsa_vision.images.pitch import MM_PER_INCH, Pitch, judge_pitch
@@ -15,6 +17,7 @@ from rsa_vision.images.raster import through_palette
 
 _MM_OF_UNIT: Final = {2: MM_PER_INCH, 3: 10.0}
 _INTEGER: Final = (1, 2, 4)  # SampleFormat: unsigned, signed, undefined
+_JPEG: Final = 7  # Compression
 _MINISWHITE, _MINISBLACK, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _REDUCED: Final = 1 | 4  # NewSubfileType: thumbnail or mask
 
@@ -68,7 +71,9 @@ def _film_page(file: Any, path: Path) -> Any:
 
 
 def _check_segments(page: Any, path: Path) -> None:
-    """Refuse a file that lacks some of its strips or tiles, which tifffile fills with zeros."""
+    """Refuse a file that lacks some of its strips or tiles, which tifffile fills with zeros, or of whose JPEG some bits are missing."""
+    import imagecodecs
+
     size = path.stat().st_size
     segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
     complete = len(segments) >= math.prod(page.chunked) and all(
@@ -76,6 +81,13 @@ def _check_segments(page: Any, path: Path) -> None:
     )
     if not complete:
         raise FilmError(f"{path}: strips or tiles are missing; the file is truncated, copy it again")
+    if int(page.compression) == _JPEG:
+        decode = partial(imagecodecs.jpeg_decode, tables=page.jpegtables)
+        with path.open("rb") as file:
+            for offset, count in segments:
+                file.seek(offset)
+                coded = file.read(count)
+                decoded(coded, jpeg_stream(coded), decode)
 
 
 def _pitch(page: Any) -> tuple[Pitch | None, str]:

@@ -323,3 +323,11 @@ def test_names_that_may_be_turned_over_say_that_upright_decides(folder: Path, tm
         for row in pl.read_csv(tmp_path / orientation / "exams.csv").to_dicts():
             assert row["status"] == status
             assert ('orientation = "upright" decides if the film lies so' in (row["message"] or "")) == (orientation == "any")
+
+
+def test_names_do_not_steer_the_terminal(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / f"{FIRST}_f1.tif").rename(folder / "S\x1b[31m.tif")
+    assert run_app(["measure", str(folder), "-o", str(tmp_path / "out")]) == 1
+    shown = capsys.readouterr()
+    assert r"S\x1b[31m" in shown.out
+    assert "\x1b" not in shown.out + shown.err

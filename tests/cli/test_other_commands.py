@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 import subprocess
@@ -18,6 +19,7 @@ import pytest
 import rsa_vision
 import rsa_vision.detect
 from rsa_vision.cli import run_app
+from rsa_vision.errors import FilmError
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import MarkerImages
 from synthetic.study import RenderedExamination, render_examination
@@ -92,6 +94,88 @@ def test_detect_goes_on_after_a_bad_film(folder: Path, tmp_path: Path, capsys: p
     assert len(pl.read_csv(tmp_path / "found.csv")) == 2
     with pytest.raises(rsa_vision.RsaError, match=r"bad\.tif"):
         rsa_vision.detect([bad])
+
+
+@pytest.mark.usefixtures("two_images")
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names themselves")
+def test_names_of_films_that_cannot_be_written_or_printed(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = next(folder.glob("*.tif"))
+    latin, steering = (Path(shutil.copy(film, tmp_path / name)) for name in ("caf\udce9.tif", "new\nline\x1b[31m.tif"))
+    out = tmp_path / "found.csv"
+    assert run_app(["detect", str(latin), str(steering), str(film), "-o", str(out)]) == 1
+    told = capsys.readouterr().err
+    assert r"caf\udce9.tif: the name is no UTF-8" in told
+    assert r"new\nline\x1b[31m.tif: 2 marker images" in told
+    assert pl.read_csv(out)["file"].unique().sort().to_list() == sorted([str(steering), str(film)])
+    steering.write_bytes(b"")
+    assert run_app(["detect", str(steering), "-o", str(out)]) == 1
+    assert r"new\nline\x1b[31m.tif: the file is empty" in capsys.readouterr().err
+
+
+def test_an_unreadable_film_fails_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    film = tmp_path / "film.tif"
+    film.write_bytes(b"II*\0")
+    monkeypatch.setattr(os, "access", lambda *_, **__: False)  # as it is for others than root
+    monkeypatch.setattr("rsa_vision.images.read_film", lambda path: _refuse(path))
+    assert run_app(["detect", str(film), "-o", str(tmp_path / "found.csv")]) == 1
+    assert "film.tif: no" in capsys.readouterr().err
+
+
+def _refuse(path: Path) -> None:
+    raise FilmError(f"{path}: no")
+
+
+def test_a_run_without_a_usable_film_leaves_the_old_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "found.csv"
+    out.write_bytes(b"old")
+    assert run_app(["detect", str(tmp_path / "*.tif"), "-o", str(out)]) == 1
+    assert out.read_bytes() == b"old"
+    assert "as it was" in capsys.readouterr().err
+
+
+def test_films_without_marks_are_named(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("rsa_vision.detect.detect_markers", lambda values, **_: SimpleNamespace(images=MarkerImages.empty()))
+    films = [str(path) for path in sorted(folder.glob("*_f1.tif"))]
+    assert run_app(["detect", *films, "-o", str(tmp_path / "found.csv")]) == 0
+    assert f"no marker image on {', '.join(films)}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["-o", "FILM/found.csv"], "another place with -o"),
+        (["-o", "TMP/" + 252 * "n" + ".csv"], "another place with -o"),
+        (["-o", "TMP/pipe.csv"], "no regular file"),
+        (["-o", "TMP/found.json"], ".csv or .parquet"),
+        (["-o", "TMP/found/"], ".csv or .parquet"),
+        (["-o", "TMP/found.csv", "--overlay", "FILM/seen.png"], "another place with --overlay"),
+        (["-o", "TMP/found.csv", "--overlay", "TMP/seen.jpg"], "ends in .png"),
+    ],
+)
+def test_what_cannot_be_written_is_told_before_the_work(
+    arguments: list[str], told: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    film = str(next(folder.glob("*.tif")))
+    os.mkfifo(tmp_path / "pipe.csv")
+    assert run_app(["detect", film, *(a.replace("TMP", str(tmp_path)).replace("FILM", film) for a in arguments)]) == 2
+    shown = capsys.readouterr().err
+    assert told in shown
+    assert "marker images" not in shown
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pipe.csv", folder.name]
+
+
+@pytest.mark.usefixtures("two_images")
+def test_endings_of_any_case_long_names_and_links(folder: Path, tmp_path: Path) -> None:
+    film = next(folder.glob("*.tif"))
+    link, long = tmp_path / "link.PARQUET", tmp_path / (251 * "n" + ".csv")
+    link.symlink_to(tmp_path / "real.parquet")
+    assert run_app(["detect", str(film), "-o", str(link), "--overlay", str(tmp_path / "seen.PNG")]) == 0
+    assert link.is_symlink()
+    assert len(pl.read_parquet(tmp_path / "real.parquet")) == 2
+    assert run_app(["detect", str(film), "-o", str(long)]) == 0
+    assert len(rsa_vision.detect(str(film))) == len(rsa_vision.detect(film)) == 2
 
 
 @pytest.fixture(scope="module")
@@ -198,13 +282,18 @@ def test_an_unexpected_failure_is_a_message_not_a_traceback(monkeypatch: pytest.
     assert "Traceback" not in message
 
 
-def test_ctrl_c_says_that_the_same_command_goes_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_says_what_is_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rsa_vision.api.measure", interrupted)
+    for command in ("measure", "detect"):
+        monkeypatch.setattr(f"rsa_vision.api.{command}", interrupted)
     assert run_app(["measure", "a", "-o", "b"]) == 130
     assert "goes on" in capsys.readouterr().err
+    assert run_app(["detect", "a", "-o", "b.csv"]) == 130
+    told = capsys.readouterr().err
+    assert "goes on" not in told
+    assert "an older one is as it was" in told
 
 
 @pytest.mark.usefixtures("two_images")
@@ -216,3 +305,25 @@ def test_films_of_one_name_have_drawings_of_their_own_and_parquet_is_parquet(fol
     assert run_app(["detect", str(film), str(same), "-o", str(out), "--overlay", str(tmp_path / "seen.png")]) == 0
     assert len(pl.read_parquet(out)) == 4
     assert sorted(path.name for path in tmp_path.glob("seen*")) == [f"seen_{film.stem}_{k}.png" for k in (1, 2)]
+    third = shutil.copy(film, tmp_path / "other" / f"{film.stem}_1.tif")  # takes the first number
+    assert run_app(["detect", str(film), str(same), str(third), "-o", str(out), "--overlay", str(tmp_path / "drawn.png")]) == 0
+    assert sorted(path.name for path in tmp_path.glob("drawn*")) == [f"drawn_{film.stem}_{k}.png" for k in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("redirection", "code"), [("2>&-", 0), (">&-", 0), (">/dev/full", 2), ("| true; exit ${PIPESTATUS[0]}", 0)], ids=str
+)
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_closed_and_full_streams_cost_nothing(redirection: str, code: int, unbuffered: str) -> None:
+    command = f"{sys.executable} -m rsa_vision cage show 1A {redirection}"
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, check=False, env=os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (code, int(code > 0)), done.stderr
+
+
+def test_what_an_encoding_lacks_is_printed_as_escapes(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "rsa_vision", "cage", "show", "1A", "-o", str(tmp_path / "骨.svg")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONIOENCODING": "ascii"})
+    assert done.returncode == 0
+    assert r"\u9aa8.svg" in done.stdout

@@ -62,6 +62,12 @@ def test_measure_folder_prints_every_marker(exam: RenderedExamination, tmp_path:
     assert distance.max() < FAR_MM
 
 
+def test_measure_folder_says_what_is_wrong(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "examples" / "measure_folder.py"), "none", "results"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+
+
 @pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md"])
 def test_the_python_of_the_pages_runs(page: str, exam: RenderedExamination, tmp_path: Path) -> None:
     code = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 import time
 from pathlib import Path
 
+import cv2
 import film_files as films
 import imagecodecs
 import numpy as np
@@ -70,6 +72,62 @@ def test_missing_strips(tmp_path: Path) -> None:
     refused(path, FilmError, "truncated")
 
 
+def overwritten(data: bytes, rng: np.random.Generator) -> bytes:
+    """Overwrite 64 bytes in the middle, as a bad sector would."""
+    middle = len(data) // 2
+    return data[:middle] + rng.integers(0, 255, 64, np.uint8).tobytes() + data[middle + 64 :]  # and no marker
+
+
+@pytest.mark.parametrize("name", ["jpeg", "jpeg-strips", "dicom-jpeg-lossless"])
+def test_decoders_that_are_out_of_step_are_asked(name: str, tmp_path: Path) -> None:
+    path, rng = tmp_path / "film", np.random.default_rng(3)
+    if name == "jpeg":
+        films.jpeg(path, films.radiograph(8))
+    elif name == "jpeg-strips":
+        films.tiff(path, films.radiograph(8), compression="jpeg")
+    else:
+        films.LOSSLESS[name][1](path)
+    data, told = path.read_bytes(), 0
+    third = len(data) // 3
+    path.write_bytes(data[:third] + bytes(third) + data[2 * third :])
+    refused(path, FilmError, "coded bits are")
+    for _ in range(20):
+        path.write_bytes(overwritten(data, rng))
+        try:
+            read_film(path)
+        except FilmError:
+            told += 1
+    assert told >= 10  # the count of bits may be right by chance
+
+
+@pytest.mark.parametrize("blank", [0, 128, 255])
+@pytest.mark.parametrize("options", [{}, {"optimize": True}, {"progressive": True}, {"restart": 7}], ids=str)
+def test_even_films_and_margins_in_jpeg_are_whole(blank: int, options: dict[str, int], tmp_path: Path) -> None:
+    names = {"optimize": cv2.IMWRITE_JPEG_OPTIMIZE, "progressive": cv2.IMWRITE_JPEG_PROGRESSIVE, "restart": cv2.IMWRITE_JPEG_RST_INTERVAL}
+    path, values = tmp_path / "film.jpg", films.radiograph(8)
+    for first in (70, 0):
+        values[first:] = blank
+        for quality in (30, 75, 100):
+            written = [cv2.IMWRITE_JPEG_QUALITY, quality, *(x for name, on in options.items() for x in (names[name], int(on)))]
+            cv2.imwrite(str(path), values, written)
+            assert read_film(path).values.shape == values.shape
+
+
+@pytest.mark.parametrize("name", ["dicom-rle", "dicom-j2k", "dicom-jls", "dicom-jpeg-lossless"])
+def test_compressed_dicom_without_its_end_is_truncated(name: str, tmp_path: Path) -> None:
+    path = films.LOSSLESS[name][1](tmp_path / "film")
+    path.write_bytes(path.read_bytes()[:-100])
+    refused(path, FilmError, "truncated")
+
+
+def test_run_length_coding_that_cannot_be_decoded_names_no_plugins(tmp_path: Path) -> None:
+    path = films.LOSSLESS["dicom-rle"][1](tmp_path / "film")
+    data = path.read_bytes()
+    third = len(data) // 3
+    path.write_bytes(data[:third] + bytes(third) + data[2 * third :])
+    refused(path, FilmError, "cannot be decoded; the file is damaged")
+
+
 # ---- kinds of files that are no films
 
 
@@ -81,7 +139,15 @@ def test_empty_and_garbage(tmp_path: Path) -> None:
     refused(path, FilmError, "not a TIFF, PNG, JPEG")
     path.write_bytes(b"%PDF-1.4" + bytes(500))
     refused(path, FilmError, "not a TIFF")
-    refused(tmp_path, FilmError, "cannot be read")
+    refused(tmp_path, FilmError, "a folder; name the films in it")
+    refused(tmp_path / "none", FilmError, "cannot be read")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n")
+    refused(path, FilmError, "ends within its header")
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.tif")
+    refused(tmp_path / "pipe.tif", FilmError, "regular file")
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64])
