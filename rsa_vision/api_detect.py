@@ -35,7 +35,7 @@ def detect(
     ----------
     images : path or sequence of path
     out : path, optional
-        File for the result, ``.csv`` or ``.parquet``. Where no film can be used it is not written, and an older one is left as it was.
+        File for the result: Parquet where it ends in ``.parquet``, else CSV. Where no film can be used an older one is left as it was.
     overlay : path, optional
         PNG file for a drawing; with several images the name of each is added to it, and a number where names are the same.
     response : str
@@ -57,7 +57,7 @@ def detect(
     SettingsError
         If the response is unknown.
     UsageError
-        If no image is given, or a result cannot be written, has the ending of another kind of file, or would take the place of a film.
+        If no image is given, or a result cannot be written, would take the place of a film, or is a drawing that does not end in ``.png``.
     """
     from rsa_vision.detect import detect_markers
     from rsa_vision.overlay import overlay_png
@@ -69,8 +69,10 @@ def detect(
         raise UsageError("no image given; name the films to look at")
     settle(None, {"response": response})  # refuses an unknown one
     drawings = [] if overlay is None else _overlay_paths(Path(overlay), films)
-    _check_targets([] if out is None else [Path(out)], "-o", (".csv", ".parquet"), films)
-    _check_targets(drawings, "--overlay", (".png",), films)
+    _check_targets([] if out is None else [Path(out)], "-o", films)
+    _check_targets(drawings, "--overlay", films)
+    if any(drawing.suffix.lower() not in ("", ".png") for drawing in drawings):
+        raise UsageError(f"{overlay}: drawings are PNG; with --overlay, name a file that ends in .png")
     rows: list[dict[str, Any]] = []
     usable = 0
     for number, path in enumerate(films):
@@ -91,7 +93,7 @@ def detect(
         if watch:
             watch(path, len(found))
     table = frame(rows, DETECTIONS)
-    if out is not None and usable:
+    if out is not None and (usable or not Path(out).exists()):
         write_atomic(Path(out), parquet_bytes(table) if Path(out).suffix.lower() == ".parquet" else to_csv(table))
     return table
 
@@ -120,12 +122,10 @@ def _overlay_paths(overlay: Path, images: Sequence[Path]) -> list[Path]:
     return paths
 
 
-def _check_targets(targets: Sequence[Path], option: str, endings: Sequence[str], images: Sequence[Path]) -> None:
+def _check_targets(targets: Sequence[Path], option: str, images: Sequence[Path]) -> None:
     """Refuse, before any work is done, results that would take the place of a film or cannot be written."""
     films = {realpath(image) for image in images}
     for target in targets:
         if realpath(target) in films:
             raise UsageError(f"{target}: is one of the films, which the result would overwrite; choose another name with {option}")
         check_target(target, option)
-        if target.suffix.lower() not in endings:
-            raise UsageError(f"{target}: no file of this kind is written; with {option}, name a file that ends in {' or '.join(endings)}")

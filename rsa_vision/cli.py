@@ -194,7 +194,7 @@ def detect(
     if blank:  # the table does not name them
         _complain(f"no marker image on {', '.join(blank)}")
     if len(failures) == len(images):
-        _complain(f"no film could be used: {out} is not written, and an older one is as it was")
+        _complain("no film could be used; an older table is as it was")
         return 1
     print(f"{len(table)} marker images on {len(images) - len(failures)} films -> {out}")
     return 1 if failures else 0

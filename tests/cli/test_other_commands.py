@@ -148,8 +148,6 @@ def test_films_without_marks_are_named(
         (["-o", "FILM/found.csv"], "another place with -o"),
         (["-o", "TMP/" + 252 * "n" + ".csv"], "another place with -o"),
         (["-o", "TMP/pipe.csv"], "no regular file"),
-        (["-o", "TMP/found.json"], ".csv or .parquet"),
-        (["-o", "TMP/found/"], ".csv or .parquet"),
         (["-o", "TMP/found.csv", "--overlay", "FILM/seen.png"], "another place with --overlay"),
         (["-o", "TMP/found.csv", "--overlay", "TMP/seen.jpg"], "ends in .png"),
     ],
