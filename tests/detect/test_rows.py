@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.neighbours.rows import in_rows, like_those_in_rows
+from rsa_vision.detect.neighbours.rows import in_bars, in_rows, like_those_in_rows
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.types import MarkerImages
 
@@ -131,3 +131,16 @@ def test_true_balls_in_line_four_diameters_apart_keep_their_names() -> None:
     images = detect_markers(stored(film), bits=16).images
     those = np.hypot(*(images.position_px[:, None] - position[:5]).transpose(2, 0, 1)).argmin(axis=0)
     assert (images.flags[those] & MarkerFlag.UNLIKE == 0).all()
+
+
+def test_three_that_lap_in_line_are_a_bar() -> None:
+    """Balls that lie anywhere do not lap as evenly; two may."""
+    bar, radius = np.array([[50.0, 50.0], [56.8, 50.3], [63.5, 50.2]]), np.array([4.3, 4.4, 4.5])
+    bent, far = bar + np.array([[0, 0], [0, 3.0], [0, 0]]), bar * [2.0, 1.0]
+    depth = np.full(3, -900.0)
+    assert in_bars(bar, radius, depth).all()
+    assert not in_bars(bent, radius, depth).any()
+    assert not in_bars(far, radius, depth).any()
+    assert not in_bars(bar[:2], radius[:2], depth[:2]).any()
+    assert not in_bars(bar, radius, depth * [1.0, 2.5, 1.0]).any()  # a pin's end between two beads
+    assert in_bars(np.append(bar, [[80.0, 50.0]], axis=0), np.append(radius, 4.4), np.full(4, -900.0)).tolist() == [True, True, True, False]

@@ -41,7 +41,7 @@ from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.neighbours.laid_on import fit_over, look_on_arms, over_arms
 from rsa_vision.detect.neighbours.not_round import are_not_round
 from rsa_vision.detect.neighbours.rims import cut_from_outlines, goes_on
-from rsa_vision.detect.neighbours.rows import in_rows, like_those_in_rows
+from rsa_vision.detect.neighbours.rows import in_bars, in_rows, like_those_in_rows
 from rsa_vision.detect.neighbours.under_curve import under_curve
 from rsa_vision.detect.search.candidates import STRENGTH, Candidates
 from rsa_vision.types import Bool, Float, Int, MarkerImages
@@ -326,6 +326,7 @@ def _measured(
     added = added[np.append(keep, np.ones(len(others), bool))]
     poor = rowed | np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
     doubtful = rowed | like_those_in_rows(balls.position_px, balls.radius_px, balls.depth, rowed, poor)
+    doubtful |= in_bars(balls.position_px, balls.radius_px, balls.depth)
     doubtful |= cut_from_outlines(touching, ends[keep]) | are_holes(film, balls, optics.sigma_px)
     doubtful |= lost_in_a_crowd(balls, _off_needles(faint, others))
     # a pin has one arm: what hides a part of it is felt at its tip

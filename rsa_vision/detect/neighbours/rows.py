@@ -1,4 +1,4 @@
-"""Rows of what looks like balls, nearer to each other than markers are put: the crests of a screw's threads."""
+"""Rows of what looks like balls, nearer to each other than markers are put: the crests of a screw's threads, and parts of a bar."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ _NEXT_TO = 0.6  # steps along it, within which others stand beside one
 _LINES = ((-2.5, -1.5), (-1.5, -0.6), (0.6, 1.5), (1.5, 2.5))
 _FELLOWS, _GAP = 2, 4.5  # others of their line, and how many steps they may be away: not every crest is seen
 _SCREW, _KIN = 12.0, 3  # diameters from others of a row, and how many of these have its size and depth
+_OFF_LINE = 0.2  # of the radius of the middle one of three that are parts of a bar
 _SAME_DEPTH, _SAME_SIZE = 1.25, 1.2  # ratios of what one thread leaves here and there
 
 
@@ -103,6 +104,33 @@ def like_those_in_rows(position_px: Float, radius_px: Float, depth: Float, rowed
     of_screw = rowed.copy()
     of_screw[perhaps[found]] = True
     out[perhaps[found]] = ~like(perhaps[found], ~(of_screw | poor)).any(axis=1)
+    return out
+
+
+def in_bars(position_px: Float, radius_px: Float, depth: Float) -> Bool:
+    """Say which balls lap over their like on either side, evenly and in line: that is how balls explain a bar, as a stroke of a letter.
+
+    Parameters
+    ----------
+    position_px : ndarray of shape (n, 2)
+    radius_px : ndarray of shape (n,)
+    depth : ndarray of shape (n,)
+        In film values.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    out = np.zeros(len(depth), bool)
+    gap = gaps(position_px, position_px)
+    lap = (gap < radius_px[:, None] + radius_px) & (gap > 0) & _alike(radius_px[:, None], radius_px, _LIKE_SIZE)
+    lap &= _alike(depth[:, None], depth, _LIKE_DEPTH)
+    for middle in np.flatnonzero(lap.sum(axis=1) >= 2):
+        beside = np.flatnonzero(lap[middle])
+        both = position_px[beside, None] + position_px[beside] - 2 * position_px[middle]
+        one, other = np.nonzero(np.hypot(*both.transpose(2, 0, 1)) < 2 * _OFF_LINE * radius_px[middle])
+        if (one != other).any():
+            out[np.append(beside[one], middle)] = True
     return out
 
 
