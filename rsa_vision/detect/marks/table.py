@@ -29,6 +29,7 @@ EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels an
 WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
 _LINE_PX = 1.01 * LEAST_HALF_WIDTH_PX  # half width of a needle that is a line
+_BLURRED = 2.0  # blur widths to which an image goes beyond its ball
 _BLUNT = 1.01 * LEAST_TAPER  # needles that are no more pointed than a fit lets them be have no tip
 _SEVERAL = 5  # tees that tell of all
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
@@ -116,7 +117,7 @@ def table_of(
     depth = np.abs(np.concatenate([balls.depth, [t.depth for t in needles]]))
     background = np.concatenate([balls.background, [t.background for t in needles]])
     flags = np.zeros(n + m, np.int64)
-    low, high = _extent(balls, needles)
+    low, high = _extent(balls, needles, optics.sigma_px)
     edge = ((low < 0) | (high > np.array(film.shape[::-1]) - 1)).any(axis=1)
     flags[edge] |= MarkerFlag.EDGE
     valid = np.concatenate([balls.valid_fraction, [t.valid_fraction for t in needles]])
@@ -168,9 +169,9 @@ def table_of(
     return table.rows(np.lexsort((position[:, 0], np.rint(position[:, 1])))), evidence
 
 
-def _extent(balls: BallFits, needles: list[NeedleFit]) -> tuple[Float, Float]:
+def _extent(balls: BallFits, needles: list[NeedleFit], sigma_px: float) -> tuple[Float, Float]:
     """Least and largest (col, row) of the images, shape (n + m, 2) each."""
-    half = balls.radius_px[:, None] + 1
+    half = balls.radius_px[:, None] + max(1.0, _BLURRED * sigma_px)
     low, high = [*(balls.position_px - half)], [*(balls.position_px + half)]
     for fit in needles:
         ends = fit.position_px + fit.shape.length_px * np.stack([np.cos(fit.angles), -np.sin(fit.angles)], axis=1)
