@@ -67,7 +67,7 @@ def detect_markers(values: NDArray[Any], *, bits: int, response: str = "auto", f
         Significant bits, 8 to 16.
     response : str
         ``auto``, ``density``, ``transmission``, ``linear`` or ``log``. The model takes the bend of the response from the film (it shows in
-        the profiles as more or less attenuation), so this is a statement about the film, not a switch; it is kept for ``run.json``.
+        the profiles as more or less attenuation), so this is a statement about the film, not a switch: nothing here depends on it.
     false_detections : float
         Expected number of marker images on a film that are noise alone.
 

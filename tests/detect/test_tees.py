@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.balls.decide import faint_beside
 from rsa_vision.detect.balls.find import fit_at
-from rsa_vision.detect.film.noise import estimate_noise
+from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
@@ -222,14 +222,20 @@ def _missed(film: NDArray[np.uint16], tips: Float) -> tuple[Float, Float]:
     return found.position_px[nearest] - tips, found.covariance_px2[nearest]
 
 
-def test_what_is_blotted_out_beside_tees_does_not_tell_what_bone_does_to_them() -> None:
-    """What lies over tees is blotted out of the film while those under it are fitted: all of a film had no covariance."""
-    rng = np.random.default_rng(8)
+def _found(seed: int) -> tuple[NDArray[np.uint16], Float, list[NeedleFit], Optics, NoiseModel]:
+    """Return a film, where the tips of its tees are, and what is found."""
+    rng = np.random.default_rng(seed)
     tips = tips_of(rng)
     film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
-    noise, optics = estimate_noise(film, 16), Optics(SIGMA_PX, 0.8)
+    noise = estimate_noise(film, 16)
     candidates = find_candidates(film, noise)
-    found, _, optics = find_tees(film, candidates.junctions, candidates.strokes, optics, noise)
+    found, _, optics = find_tees(film, candidates.junctions, candidates.strokes, Optics(SIGMA_PX, 0.8), noise)
+    return film, tips, found, optics, noise
+
+
+def test_what_is_blotted_out_beside_tees_does_not_tell_what_bone_does_to_them() -> None:
+    """What lies over tees is blotted out of the film while those under it are fitted: all of a film had no covariance."""
+    film, tips, found, optics, noise = _found(8)
     bare = film.astype(np.float64)
     for col, row in np.rint(tips[::3] + np.array([SIDE / (2 * CELLS), 0])).astype(int):
         bare[row - 8 : row + 9, col - 8 : col + 9] = np.nan
@@ -240,12 +246,7 @@ def test_what_is_blotted_out_beside_tees_does_not_tell_what_bone_does_to_them() 
 
 def test_needles_that_are_fitted_together_stay_in_their_order() -> None:
     """Sets whose arms cross are fitted in one go, wherever in the list they are."""
-    rng = np.random.default_rng(3)
-    tips = tips_of(rng)
-    film = exposed(light_past_tees(tips, np.ones(len(tips))), rng)
-    noise, optics = estimate_noise(film, 16), Optics(SIGMA_PX, 0.8)
-    candidates = find_candidates(film, noise)
-    found, _, optics = find_tees(film, candidates.junctions, candidates.strokes, optics, noise)
+    film, _, found, optics, noise = _found(3)
     beside = min(found[1:], key=lambda t: float(np.hypot(*(t.position_px - found[0].position_px))))
     between = [t for t in found if t is not found[0] and t is not beside]
     longer = [replace(t, shape=replace(t.shape, length_px=1.6 * t.shape.length_px)) for t in (found[0], *between[:3], beside)]
