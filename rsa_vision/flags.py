@@ -16,7 +16,7 @@ class MarkerFlag(IntFlag):
     NONE = 0
     OVERLAP = 1  # fitted jointly with a neighbour that it overlaps, or as dense a thing beside it
     EDGE = 2  # its image reaches over the edge of the film
-    SATURATED = 4  # saturated pixels under it were masked
+    SATURATED = 4  # saturated pixels under it were masked, or the film beside it is at the flat end of its curve
     CLIPPED = 8  # so much was masked that the coordinates lean on little
     POOR_FIT = 16  # the model does not describe the film here within its noise, or leaves the place open
     REJECTED = 32  # left out by a gross-error rule

@@ -9,6 +9,7 @@ from rsa_vision.detect import _detect, detect_markers
 from rsa_vision.detect.balls.find import significance_limit
 from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.marks.response import in_film_values, log_odds
+from rsa_vision.flags import MarkerFlag
 from rsa_vision.threads import in_one_thread
 from rsa_vision.types import Float, MarkerImages
 
@@ -23,11 +24,11 @@ LARGEST_PX = 0.03  # root mean square of the distances
 Z_BAND, Z_MAX = (0.5, 1.2), 4.5
 
 
-def lit(speed: float, rng: np.random.Generator) -> tuple[Float, Float]:
+def lit(speed: float, rng: np.random.Generator, quanta: float = QUANTA) -> tuple[Float, Float]:
     """Return a film of transmitted light, in parts of full scale, exposed three times as long at one side, and the truth."""
     truth, radius = grid_of_balls(rng, 7, 98.0, (RADIUS_PX, RADIUS_PX))
     exposure = film_of_balls((SIDE, SIDE), truth, radius, background=1.0, depth=0.92, sigma_px=SIGMA_PX) * np.linspace(1.0, 1 / 3, SIDE)
-    exposure = exposure + np.sqrt(exposure / QUANTA) * rng.standard_normal(exposure.shape)
+    exposure = exposure + np.sqrt(exposure / quanta) * rng.standard_normal(exposure.shape)
     return 10 ** -(RANGE / (1 + (speed / np.maximum(exposure, 1e-3)) ** STEEPNESS)), truth
 
 
@@ -55,6 +56,22 @@ def test_balls_on_films_of_light_are_where_they_are_said_to_be(speed: float, bit
     assert np.sqrt(np.mean(np.square(away))) < LARGEST_PX
     assert Z_BAND[0] < np.sqrt(np.mean(np.square(ratio)) / 2) < Z_BAND[1]
     assert max(ratio) < Z_MAX
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_where_black_film_hides_rims_and_noise_balls_are_flagged(bits: int) -> None:
+    """Of few values: what seems free of noise outside of a rim is none, and weighed it decided where the ball is."""
+    light, truth = lit(0.12, np.random.default_rng(1), quanta=300.0)
+    scale = 2 ** (bits - 8)
+    images = detect_markers(stored(scale * (10 + 240 * light), bits), bits=bits).images
+    gap = np.hypot(*(truth[:, None] - images.position_px[None]).transpose(2, 0, 1))
+    seen = gap.min(axis=1) < 2.0
+    assert np.count_nonzero(seen) == len(images) > 0.8 * len(truth)
+    _, ratio = errors(images, truth[seen])
+    flat = images.flags & MarkerFlag.SATURATED > 0
+    assert np.mean(flat) > 0.8 if bits < 16 else not flat.any()
+    assert ratio.max() < 4.0
+    assert np.sqrt(np.mean(np.square(ratio)) / 2) < Z_BAND[1]
 
 
 def test_values_of_light_are_given_back() -> None:

@@ -14,6 +14,7 @@ from rsa_vision.detect.balls.fits import BallFits, radii
 from rsa_vision.detect.balls.optics import CAP, OF_CUT_OFF
 from rsa_vision.detect.balls.unlike import COMPANY, of_odd_size, too_deep, too_pale
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.tiles import QUANTISATION
 from rsa_vision.detect.marks.resolve import doubt_of_number
 from rsa_vision.detect.marks.settle import STRUCTURE
 from rsa_vision.detect.models.needles import NeedleFit, wrapped
@@ -37,6 +38,8 @@ _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the 
 _SLIGHT = 0.02  # of the depth of a ball: structure around it that is no edge, however little noise there is
 _SEEN = 0.5  # of a doubtful misfit, that noise makes seldom
 _UNLIKE = 2.0  # times the misfit that is usual on the film
+_STEEPER = 10.0  # times the answer to light beside a ball, where film under it gives that: beside it its curve has come to its flat end
+_DOWN = np.linspace(0.0, 1.0, 11)  # the values under a ball, in units of its depth
 _ROOM = 2.0  # standard deviations: nearer to an end of the range the mean of what is left of the noise is not that of the film
 
 
@@ -124,6 +127,10 @@ def table_of(
     for k in np.flatnonzero((valid < WHOLE) & ~edge):  # else something lies over it that is left out of the fit
         flags[k] |= MarkerFlag.SATURATED if _at_an_end(film, low[k], high[k], noise) else MarkerFlag.CLIPPED
     flags[valid < CUT_OFF] |= MarkerFlag.CLIPPED
+    flat = _film_is_flat(balls, noise)
+    flags[:n][flat] |= MarkerFlag.SATURATED
+    short = _by_noise_under(balls.rows(flat), optics.sigma_px, noise) - np.linalg.eigvalsh(covariance[:n][flat])[:, 0]
+    covariance[:n][flat] += np.maximum(short, 0.0)[:, None, None] * np.eye(2)
     flags[n:][[_noise_is_cut_off(t, noise) for t in needles]] |= MarkerFlag.SATURATED | MarkerFlag.CLIPPED
     flags[touching] |= MarkerFlag.OVERLAP
     arms = np.array([len(t.angles) for t in needles])
@@ -186,6 +193,30 @@ def _at_an_end(film: NDArray[Any], low: Float, high: Float, noise: NoiseModel) -
     (left, top), (right, bottom) = np.floor(low).astype(int), np.ceil(high).astype(int) + 1
     values = film[max(top, 0) : bottom, max(left, 0) : right]
     return bool(((values <= noise.floor) | (values >= noise.ceiling)).any())
+
+
+def _film_is_flat(balls: BallFits, noise: NoiseModel) -> Bool:
+    """Say beside which balls the film is at the flat end of its curve, as in black air: it hides their rims and changes of the light.
+
+    It hides the noise as well, which is seen under them.
+    """
+    beside = np.maximum(noise.variance_at(balls.background) - QUANTISATION, QUANTISATION)
+    return np.asarray(_noise_under(balls, noise).max(axis=1) - QUANTISATION > _STEEPER**2 * beside)
+
+
+def _noise_under(balls: BallFits, noise: NoiseModel) -> Float:
+    """Return the variance at values from the background to the middle of each ball, shape (n, k)."""
+    return noise.variance_at(balls.background[:, None] + balls.depth[:, None] * _DOWN)
+
+
+def _by_noise_under(balls: BallFits, sigma_px: float, noise: NoiseModel) -> Float:
+    """Return the variance of one coordinate of centres, px^2, that a rim tells through the noise there is under the ball, shape (n,).
+
+    What seems free of noise outside of it is no rim where the film hides that. A rim of depth d, blurred by a Gaussian, tells of a shift
+    d^2 / (2 sqrt(pi) sigma) over the noise for each pixel of its length, of which a coordinate has half.
+    """
+    variance = balls.chi2_core * _noise_under(balls, noise).mean(axis=1)
+    return np.asarray(2 * sigma_px * variance / (np.sqrt(np.pi) * balls.radius_px * balls.depth**2))
 
 
 def _noise_is_cut_off(fit: NeedleFit, noise: NoiseModel) -> bool:
