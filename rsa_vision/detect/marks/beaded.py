@@ -17,20 +17,22 @@ from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.arms import meet_others
-from rsa_vision.detect.needles.balls_beside import BallsBeside, lapped, masked_under
+from rsa_vision.detect.needles.balls_beside import BallsBeside, lapped, mask_under
 from rsa_vision.detect.needles.crossing import fit_crossing
 from rsa_vision.detect.needles.fits import PROMISING, explains
 from rsa_vision.detect.needles.of_a_kind import is_of_kind, starts_like, typical_of
 from rsa_vision.detect.needles.pins import fit_beside_balls
 from rsa_vision.detect.needles.pointed import either_way, middle, unexplained
 from rsa_vision.detect.needles.sets import NEAREST_PX
-from rsa_vision.detect.neighbours.beside import all_but, deep_at, without_balls
+from rsa_vision.detect.neighbours.beside import all_but, deep_at, take_balls
 from rsa_vision.detect.neighbours.laid_on import over_arms
 from rsa_vision.types import Bool, Float
 
 _STEPS = 10  # of a pin's length, between places where it may be
 _LOW = 0.1  # of the height of a typical pin, over the film around a place on one
 _MOST_IN_VAIN = 3  # starts near one ball
+# pin lengths from a ball that a fit may see: of the place, of its tip from there, of how far that may move, and of what lies behind
+_SEEN_FROM = 5.0
 _MOST_OVER = 2  # balls found on what may be a pin
 
 
@@ -76,8 +78,8 @@ def _hidden(
     more, on_them, all_painted = list[NeedleFit](), [balls.rows(slice(0))], painted
     if typical := typical_of(pins, noise):
         sure = plausible(balls, noise)  # what only an edge beside it explains may be the thick end of a pin
-        bare, rest = (painted.taken_from(without_balls(film, of, optics), 0, 0) for of in (balls.rows(sure), balls))
-        masked = masked_under(rest, balls, optics)
+        bare, masked = (_without(film, of, painted, balls.position_px, typical, optics) for of in (balls.rows(sure), balls))
+        mask_under(masked, balls, optics)
         places, in_vain = _around(balls, typical.shape.length_px), np.zeros(len(sure), np.intp)
         places = places[deep_at(bare, places, typical.shape.half_width_px, None) > _LOW * abs(typical.height)]
         for start in starts_like(bare, masked, typical, places, painted.needles, pin_optics, noise):
@@ -93,6 +95,19 @@ def _hidden(
                 on_them.append(one[1])
                 all_painted = painted.and_more([(f, pin_optics) for f in more])
     return more, join(on_them)
+
+
+def _without(
+    film: NDArray[Any], balls: BallFits, painted: Painted, places: Float, typical: NeedleFit, optics: Optics
+) -> NDArray[np.float32]:
+    """Return the film as far around places as fits of pins on them see, without balls and needles; zero elsewhere, which takes no memory."""
+    out, half = np.zeros(film.shape, np.float32), int(_SEEN_FROM * typical.shape.length_px)
+    for col, row in np.rint(places).astype(np.intp):
+        box = slice(max(row - half, 0), max(row + half + 1, 0)), slice(max(col - half, 0), max(col + half + 1, 0))
+        out[box] = film[box]
+    take_balls(out, balls, optics)
+    painted.near(places, half).take_from(out, 0, 0)
+    return out
 
 
 def _is_there(needle: NeedleFit, fitted: list[NeedleFit]) -> bool:

@@ -72,12 +72,23 @@ class Painted:
     def taken_from(self, box: NDArray[Any], left: int, top: int) -> NDArray[np.float32]:
         """Return a box of the film, whose first pixel is at this column and row, without the images."""
         out = box.astype(np.float32)
+        self.take_from(out, left, top)
+        return out
+
+    def take_from(self, box: NDArray[np.float32], left: int, top: int) -> None:
+        """Take the images away from a box of the film, in place."""
         side, size = self.images.shape[1], np.array(box.shape[::-1])
         low = self.corner_px - [left, top]
         for k in np.flatnonzero(((low < size) & (low + side > 0)).all(1)):
             (c0, r0), (c1, r1) = np.maximum(low[k], 0), np.minimum(low[k] + side, size)
-            out[r0:r1, c0:c1] -= self.images[k, r0 - low[k, 1] : r1 - low[k, 1], c0 - low[k, 0] : c1 - low[k, 0]]
-        return out
+            box[r0:r1, c0:c1] -= self.images[k, r0 - low[k, 1] : r1 - low[k, 1], c0 - low[k, 0] : c1 - low[k, 0]]
+
+    def near(self, places: Float, half: int) -> Painted:
+        """Return those of which something may be seen in squares around places."""
+        reach = half + self.images.shape[1]
+        tips = np.array([f.position_px for f in self.needles]).reshape(-1, 2)
+        kept = np.flatnonzero((np.abs(tips[:, None] - places) < reach).all(axis=2).any(axis=1))
+        return Painted(self.corner_px[kept], self.images[kept], [self.needles[k] for k in kept], [self.optics[k] for k in kept])
 
     def explain(self, film: NDArray[Any], position_px: Float, radius_px: Float) -> Bool:
         """Say at which places (n, 2) the needles make nearly all by which a disc differs from a ring around it, shape (n,)."""

@@ -60,16 +60,14 @@ def under_balls(balls: BallFits, optics: Optics, cols: Float, rows: Float) -> Bo
     return hidden
 
 
-def masked_under(film: NDArray[np.float32], balls: BallFits, optics: Optics) -> NDArray[np.float32]:
-    """Return a film with NaN where balls hide what is under them."""
-    out = film.copy()
+def mask_under(film: NDArray[np.float32], balls: BallFits, optics: Optics) -> None:
+    """Put NaN where balls hide what is under them, in place."""
     for k, (col, row) in enumerate(np.rint(balls.position_px).astype(np.intp)):
         reach = int(balls.radius_px[k] + _FADED * optics.sigma_px) + 1
         top, left = max(row - reach, 0), max(col - reach, 0)
-        box = out[top : max(row + reach + 1, 0), left : max(col + reach + 1, 0)]
+        box = film[top : max(row + reach + 1, 0), left : max(col + reach + 1, 0)]
         rows, cols = np.mgrid[top : top + box.shape[0], left : left + box.shape[1]].astype(np.float64)
         box[under_balls(balls.rows([k]), optics, cols, rows)] = np.nan
-    return out
 
 
 def lapped(pins: list[NeedleFit], balls: BallFits, optics: Optics) -> Bool:

@@ -49,7 +49,7 @@ class LaidOver:
 
 
 def laid_over(film: NDArray[Any], places: Float, pins: Sequence[NeedleFit], optics: Optics) -> list[LaidOver]:
-    """Return for every place how one of these pins lies over it most like the film, likest first.
+    """Return for every place, once a pixel, how one of these pins lies over it most like the film, likest first.
 
     Parameters
     ----------
@@ -65,6 +65,8 @@ def laid_over(film: NDArray[Any], places: Float, pins: Sequence[NeedleFit], opti
     list of LaidOver
     """
     pixel = np.rint(places).astype(np.intp)
+    first_there = np.sort(np.unique(pixel, axis=0, return_index=True)[1])
+    places, pixel = places[first_there], pixel[first_there]
     best = np.full(len(places), -1.0)
     which = np.zeros((len(places), 2), np.intp)
     coarse = optics.pooled(_SCALE)

@@ -33,7 +33,7 @@ from rsa_vision.detect.needles.pointed import (
 from rsa_vision.detect.needles.sets import on_arms
 from rsa_vision.types import Float
 
-_MOST_IN_VAIN = 60  # places in a row at which there are none
+_MOST_IN_VAIN = 50  # places in a row at which there are none
 _ROUGHLY = 0.5  # of what a pin must have, for a closer look
 _ODD = 6.0  # half the chi2 by which chance makes a pin of the known size worse than a rod, or a pin, of free size
 _PALE = 0.5  # of the typical depth
@@ -67,8 +67,8 @@ def others_like(film: NDArray[Any], known: list[NeedleFit], places: Float, optic
         return []
     out: list[NeedleFit] = []
     in_vain = 0
-    for start in laid_over(film, places, [typical], optics):
-        if on_arms(start.place[None], [*known, *out]).any():
+    for start in laid_over(film, places[~on_arms(places, known)], [typical], optics):
+        if on_arms(start.place[None], out).any():
             continue
         in_vain += 1
         if in_vain > _MOST_IN_VAIN:
@@ -125,10 +125,10 @@ def starts_like(
     """
     out: list[NeedleFit] = []
     in_vain = 0
-    for start in laid_over(film, places, [typical], optics):
+    for start in laid_over(film, places[~on_arms(places, known)], [typical], optics):
         if start.likeness < LIKENESS or in_vain == _MOST_IN_VAIN:
             break
-        if on_arms(start.place[None], [*known, *out]).any():
+        if on_arms(start.place[None], out).any():
             continue
         fit = fit_needles(bare, start.pin.position_px, start.pin.angles, typical.shape, optics, noise, quick=True, sized=True)
         in_vain += 1

@@ -57,15 +57,13 @@ def images_beside(known: BallFits, members: Int, optics: Optics, needles: Images
     return total, doubtful
 
 
-def without_balls(film: NDArray[Any], balls: BallFits, optics: Optics) -> NDArray[np.float32]:
-    """Return the film without the images of balls."""
-    out = film.astype(np.float32)
+def take_balls(film: NDArray[np.float32], balls: BallFits, optics: Optics) -> None:
+    """Take the images of balls away from a film, in place."""
     for at, radius, depth in zip(balls.position_px, balls.radius_px, balls.depth, strict=True):
         reach = radius + 4 * optics.sigma_px
         (left, top), (right, bottom) = (np.clip(np.rint(at + step), 0, film.shape[::-1]).astype(np.intp) for step in (-reach, reach + 1))
         dx, dy = np.meshgrid(np.arange(left, right) - at[0], np.arange(top, bottom) - at[1])
-        out[top:bottom, left:right] -= depth * ball_image(dx[None], dy[None], np.array([radius]), optics.sigma_px, optics.mu_px)[0]
-    return out
+        film[top:bottom, left:right] -= depth * ball_image(dx[None], dy[None], np.array([radius]), optics.sigma_px, optics.mu_px)[0]
 
 
 def deep_at(film: NDArray[Any], peaks: Float, radius: float, needles: Images | None) -> Float:
