@@ -78,6 +78,11 @@ class NoiseModel:
         """Most of the noise are errors of lossy compression, around marks and edges: even film has none."""
         return self.pattern > 0
 
+    def of_box(self, corner_px: Int) -> NoiseModel:
+        """Return the noise of a part of the film that begins at this (col, row)."""
+        cols, rows = (lines - first for lines, first in zip(self.repaired, corner_px, strict=True))
+        return replace(self, repaired=(cols, rows))
+
     def rises_above(self, height: Float, background: Float) -> Bool:
         """Say which images, of heights without sign on these backgrounds (same shape), lossy compression has not made."""
         return np.asarray(height > _WAVES * self.pattern * np.sqrt(self.variance_at(background)))

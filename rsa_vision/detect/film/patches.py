@@ -42,6 +42,28 @@ class Patches:
         return cols, rows
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Box:
+    """A part of a film, with something taken away.
+
+    Attributes
+    ----------
+    values : ndarray of float32, shape (rows, cols)
+    corner_px : ndarray of int, shape (2,)
+        (col, row) of its first pixel.
+    """
+
+    values: NDArray[np.float32]
+    corner_px: Int
+
+
+def box_of(film: NDArray[Any], place_px: Float, half: int) -> Box:
+    """Copy a box of ``2 half + 1`` pixels, or what the film has of that, around a place (col, row)."""
+    low = np.maximum(np.rint(place_px).astype(np.intp) - half, 0)
+    high = np.maximum(np.rint(place_px).astype(np.intp) + half + 1, 0)
+    return Box(film[low[1] : high[1], low[0] : high[0]].astype(np.float32), low)
+
+
 def cut(film: NDArray[Any], centres_px: Float, half: int, noise: NoiseModel) -> Patches:
     """Cut windows of ``2 half + 1`` pixels around rounded centres.
 

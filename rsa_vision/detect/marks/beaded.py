@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.find import plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.patches import Box, box_of
 from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.models.needles import NeedleFit
@@ -31,8 +32,7 @@ from rsa_vision.types import Bool, Float
 _STEPS = 10  # of a pin's length, between places where it may be
 _LOW = 0.1  # of the height of a typical pin, over the film around a place on one
 _MOST_IN_VAIN = 3  # starts near one ball
-# pin lengths from a ball that a fit may see: of the place, of its tip from there, of how far that may move, and of what lies behind
-_SEEN_FROM = 5.0
+_SEEN_FROM = 5.0  # pin lengths from a ball, of the place, its tip, and its way from there, and what lies around that: all that a fit sees
 _MOST_OVER = 2  # balls found on what may be a pin
 
 
@@ -78,11 +78,19 @@ def _hidden(
     more, on_them, all_painted = list[NeedleFit](), [balls.rows(slice(0))], painted
     if typical := typical_of(pins, noise):
         sure = plausible(balls, noise)  # what only an edge beside it explains may be the thick end of a pin
-        bare, masked = (_without(film, of, painted, balls.position_px, typical, optics) for of in (balls.rows(sure), balls))
-        mask_under(masked, balls, optics)
-        places, in_vain = _around(balls, typical.shape.length_px), np.zeros(len(sure), np.intp)
-        places = places[deep_at(bare, places, typical.shape.half_width_px, None) > _LOW * abs(typical.height)]
-        for start in starts_like(bare, masked, typical, places, painted.needles, pin_optics, noise):
+        half = int(_SEEN_FROM * typical.shape.length_px)
+
+        def bare(place: Float) -> Box:
+            return _without(film, balls.rows(sure), painted, place, half, optics)
+
+        def masked(place: Float) -> Box:
+            box = _without(film, balls, painted, place, half, optics)
+            mask_under(box, balls, optics)
+            return box
+
+        looks = (_look(bare(place), place, typical) for place in balls.position_px)
+        in_vain = np.zeros(len(sure), np.intp)
+        for start in starts_like(looks, masked, typical, painted.needles, pin_optics, noise):
             nearest = np.hypot(*(balls.position_px - middle(start)).T).argmin()
             others = all_but(balls.rows(sure), np.arange(0), optics, all_painted)
             left = fit_crossing(film, [start], pin_optics, noise, others=others, quick=True)[0]  # of what has been found since less is
@@ -97,30 +105,26 @@ def _hidden(
     return more, join(on_them)
 
 
-def _without(
-    film: NDArray[Any], balls: BallFits, painted: Painted, places: Float, typical: NeedleFit, optics: Optics
-) -> NDArray[np.float32]:
-    """Return the film as far around places as fits of pins on them see, without balls and needles; zero elsewhere, which takes no memory."""
-    out, half = np.zeros(film.shape, np.float32), int(_SEEN_FROM * typical.shape.length_px)
-    for col, row in np.rint(places).astype(np.intp):
-        box = slice(max(row - half, 0), max(row + half + 1, 0)), slice(max(col - half, 0), max(col + half + 1, 0))
-        out[box] = film[box]
-    take_balls(out, balls, optics)
-    painted.near(places, half).take_from(out, 0, 0)
-    return out
+def _without(film: NDArray[Any], balls: BallFits, painted: Painted, place: Float, half: int, optics: Optics) -> Box:
+    """Return the film around a place without balls and needles."""
+    box = box_of(film, place, half)
+    take_balls(box, balls, optics)
+    painted.take_from(box)
+    return box
+
+
+def _look(box: Box, ball: Float, typical: NeedleFit) -> tuple[Box, Float]:
+    """Return a box and the places (n, 2) around a ball in it, out to the length of a pin, where something lies."""
+    step = typical.shape.length_px / _STEPS
+    axis = step * np.arange(-_STEPS, _STEPS + 1)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    places = ball + grid[np.hypot(*grid.T) < typical.shape.length_px]
+    deep = deep_at(box.values, places - box.corner_px, typical.shape.half_width_px, None)
+    return box, places[deep > _LOW * abs(typical.height)]
 
 
 def _is_there(needle: NeedleFit, fitted: list[NeedleFit]) -> bool:
     return any(math.dist(needle.position_px, f.position_px) < NEAREST_PX for f in fitted)
-
-
-def _around(balls: BallFits, length_px: float) -> Float:
-    """Places (n, 2) around balls, out to the length of a pin."""
-    step = length_px / _STEPS
-    axis = step * np.arange(-_STEPS, _STEPS + 1)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    grid = grid[np.hypot(*grid.T) < length_px]
-    return np.asarray((balls.position_px[:, None] + grid).reshape(-1, 2))
 
 
 def _one_of(

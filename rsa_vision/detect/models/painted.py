@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.film.patches import Box
 from rsa_vision.detect.models.needles import NeedleFit, needle_image, support
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
@@ -71,24 +72,17 @@ class Painted:
 
     def taken_from(self, box: NDArray[Any], left: int, top: int) -> NDArray[np.float32]:
         """Return a box of the film, whose first pixel is at this column and row, without the images."""
-        out = box.astype(np.float32)
-        self.take_from(out, left, top)
-        return out
+        out = Box(box.astype(np.float32), np.array([left, top]))
+        self.take_from(out)
+        return out.values
 
-    def take_from(self, box: NDArray[np.float32], left: int, top: int) -> None:
+    def take_from(self, box: Box) -> None:
         """Take the images away from a box of the film, in place."""
-        side, size = self.images.shape[1], np.array(box.shape[::-1])
-        low = self.corner_px - [left, top]
+        film, side, size = box.values, self.images.shape[1], np.array(box.values.shape[::-1])
+        low = self.corner_px - box.corner_px
         for k in np.flatnonzero(((low < size) & (low + side > 0)).all(1)):
             (c0, r0), (c1, r1) = np.maximum(low[k], 0), np.minimum(low[k] + side, size)
-            box[r0:r1, c0:c1] -= self.images[k, r0 - low[k, 1] : r1 - low[k, 1], c0 - low[k, 0] : c1 - low[k, 0]]
-
-    def near(self, places: Float, half: int) -> Painted:
-        """Return those of which something may be seen in squares around places."""
-        reach = half + self.images.shape[1]
-        tips = np.array([f.position_px for f in self.needles]).reshape(-1, 2)
-        kept = np.flatnonzero((np.abs(tips[:, None] - places) < reach).all(axis=2).any(axis=1))
-        return Painted(self.corner_px[kept], self.images[kept], [self.needles[k] for k in kept], [self.optics[k] for k in kept])
+            film[r0:r1, c0:c1] -= self.images[k, r0 - low[k, 1] : r1 - low[k, 1], c0 - low[k, 0] : c1 - low[k, 0]]
 
     def explain(self, film: NDArray[Any], position_px: Float, radius_px: Float) -> Bool:
         """Say at which places (n, 2) the needles make nearly all by which a disc differs from a ring around it, shape (n,)."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.detect.film.patches import Box
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
@@ -60,14 +60,17 @@ def under_balls(balls: BallFits, optics: Optics, cols: Float, rows: Float) -> Bo
     return hidden
 
 
-def mask_under(film: NDArray[np.float32], balls: BallFits, optics: Optics) -> None:
+def mask_under(box: Box, balls: BallFits, optics: Optics) -> None:
     """Put NaN where balls hide what is under them, in place."""
-    for k, (col, row) in enumerate(np.rint(balls.position_px).astype(np.intp)):
-        reach = int(balls.radius_px[k] + _FADED * optics.sigma_px) + 1
-        top, left = max(row - reach, 0), max(col - reach, 0)
-        box = film[top : max(row + reach + 1, 0), left : max(col + reach + 1, 0)]
-        rows, cols = np.mgrid[top : top + box.shape[0], left : left + box.shape[1]].astype(np.float64)
-        box[under_balls(balls.rows([k]), optics, cols, rows)] = np.nan
+    n_rows, n_cols = box.values.shape
+    for k, at in enumerate(balls.position_px - box.corner_px):
+        reach = balls.radius_px[k] + _FADED * optics.sigma_px
+        (left, top), (right, bottom) = (
+            np.clip(np.rint(at) + step, 0, (n_cols, n_rows)).astype(np.intp) for step in (-reach - 1, reach + 2)
+        )
+        rows, cols = np.mgrid[top:bottom, left:right].astype(np.float64)
+        hidden = np.hypot(cols - at[0], rows - at[1]) < reach
+        box.values[top:bottom, left:right][hidden] = np.nan
 
 
 def lapped(pins: list[NeedleFit], balls: BallFits, optics: Optics) -> Bool:

@@ -6,6 +6,7 @@ asked whether it is one. Those on the edges of bones are fitted with the edge.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -13,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.patches import Box
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import fit_crossing
 from rsa_vision.detect.needles.fits import explains, fit_needles
-from rsa_vision.detect.needles.laid_over import LIKENESS, laid_over
+from rsa_vision.detect.needles.laid_over import LIKENESS, LaidOver, laid_over
 from rsa_vision.detect.needles.pointed import (
     LEAST_OF_A_KIND,
     RATHER_THAN_TURNED,
@@ -31,7 +33,7 @@ from rsa_vision.detect.needles.pointed import (
     worse_by,
 )
 from rsa_vision.detect.needles.sets import on_arms
-from rsa_vision.types import Float
+from rsa_vision.types import Float, Int
 
 _MOST_IN_VAIN = 50  # places in a row at which there are none
 _ROUGHLY = 0.5  # of what a pin must have, for a closer look
@@ -95,10 +97,9 @@ def typical_of(known: list[NeedleFit], noise: NoiseModel) -> NeedleFit | None:
 
 
 def starts_like(
-    film: NDArray[Any],
-    bare: NDArray[Any],
+    looks: Iterable[tuple[Box, Float]],
+    masked: Callable[[Float], Box],
     typical: NeedleFit,
-    places: Float,
     known: list[NeedleFit],
     optics: Optics,
     noise: NoiseModel,
@@ -107,12 +108,12 @@ def starts_like(
 
     Parameters
     ----------
-    film, bare : ndarray of shape (rows, cols)
-        Where they are sought, and fitted: NaN where they are hidden.
+    looks : iterable of (Box, ndarray of shape (n, 2))
+        Parts of the film where they are sought, and places on such pins there, (col, row) on the film.
+    masked : callable
+        The film around a place, where they are fitted: NaN where they are hidden.
     typical : NeedleFit
         As of :func:`typical_of`.
-    places : ndarray of shape (n, 2)
-        On such pins, (col, row).
     known : list of NeedleFit
         Nothing is looked for on these.
     optics : Optics
@@ -123,17 +124,24 @@ def starts_like(
     list of NeedleFit
         Of the typical size, likest first.
     """
+    starts = list[tuple[LaidOver, Int]]()
+    for box, places in looks:
+        free = places[~on_arms(places, known)] - box.corner_px
+        starts += [(start, box.corner_px) for start in laid_over(box.values, free, [typical], optics)]
     out: list[NeedleFit] = []
     in_vain = 0
-    for start in laid_over(film, places[~on_arms(places, known)], [typical], optics):
+    for start, corner in sorted(starts, key=lambda of: -of[0].likeness):
         if start.likeness < LIKENESS or in_vain == _MOST_IN_VAIN:
             break
-        if on_arms(start.place[None], out).any():
+        place = start.place + corner
+        if on_arms(place[None], out).any():
             continue
-        fit = fit_needles(bare, start.pin.position_px, start.pin.angles, typical.shape, optics, noise, quick=True, sized=True)
+        box = masked(place)
+        tip, noise_there = start.pin.position_px + corner - box.corner_px, noise.of_box(box.corner_px)
+        fit = fit_needles(box.values, tip, start.pin.angles, typical.shape, optics, noise_there, quick=True, sized=True)
         in_vain += 1
         if fit.depth * typical.depth > 0 and fit.significance > _ROUGHLY * SIGNIFICANT and explains(fit, _ROUGHLY):
-            out.append(fit)
+            out.append(replace(fit, position_px=fit.position_px + box.corner_px))
             in_vain = 0
     return out
 

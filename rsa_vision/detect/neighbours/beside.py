@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls.fits import BallFits, ball_image
+from rsa_vision.detect.film.patches import Box
 from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
@@ -57,13 +58,15 @@ def images_beside(known: BallFits, members: Int, optics: Optics, needles: Images
     return total, doubtful
 
 
-def take_balls(film: NDArray[np.float32], balls: BallFits, optics: Optics) -> None:
-    """Take the images of balls away from a film, in place."""
-    for at, radius, depth in zip(balls.position_px, balls.radius_px, balls.depth, strict=True):
+def take_balls(box: Box, balls: BallFits, optics: Optics) -> None:
+    """Take the images of balls away from a box of the film, in place."""
+    film, size = box.values, box.values.shape[::-1]
+    for at, radius, depth in zip(balls.position_px - box.corner_px, balls.radius_px, balls.depth, strict=True):
         reach = radius + 4 * optics.sigma_px
-        (left, top), (right, bottom) = (np.clip(np.rint(at + step), 0, film.shape[::-1]).astype(np.intp) for step in (-reach, reach + 1))
-        dx, dy = np.meshgrid(np.arange(left, right) - at[0], np.arange(top, bottom) - at[1])
-        film[top:bottom, left:right] -= depth * ball_image(dx[None], dy[None], np.array([radius]), optics.sigma_px, optics.mu_px)[0]
+        (left, top), (right, bottom) = (np.clip(np.rint(at + step), 0, size).astype(np.intp) for step in (-reach, reach + 1))
+        if left < right and top < bottom:
+            dx, dy = np.meshgrid(np.arange(left, right) - at[0], np.arange(top, bottom) - at[1])
+            film[top:bottom, left:right] -= depth * ball_image(dx[None], dy[None], np.array([radius]), optics.sigma_px, optics.mu_px)[0]
 
 
 def deep_at(film: NDArray[Any], peaks: Float, radius: float, needles: Images | None) -> Float:
