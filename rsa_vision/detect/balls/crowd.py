@@ -6,7 +6,7 @@ import numpy as np
 
 from rsa_vision.detect.balls.decide import CLOSE
 from rsa_vision.detect.balls.fits import BallFits
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import pairs_within
 from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float
 
@@ -83,8 +83,8 @@ def lost_in_a_crowd(balls: BallFits, candidates: Candidates) -> Bool:
 
 def _answers(balls: BallFits, candidates: Candidates) -> tuple[Float, Float]:
     """Strongest answers of the filter to balls (n,), and those to all that is round and none of them."""
-    gap = gaps(candidates.position_px, balls.position_px)
-    at = gap < balls.radius_px + _NEAR_PX
-    strength = np.abs(candidates.strength)
-    own = np.where(at, strength[:, None], 0.0).max(axis=0, initial=0.0)
-    return own, strength[~at.any(axis=1) & (candidates.roundness > _ROUND)]
+    at, ball = pairs_within(candidates.position_px, balls.position_px, balls.radius_px + _NEAR_PX)
+    strength, own, free = np.abs(candidates.strength), np.zeros(len(balls.depth)), candidates.roundness > _ROUND
+    np.maximum.at(own, ball, strength[at])
+    free[at] = False
+    return own, strength[free]

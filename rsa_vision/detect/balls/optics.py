@@ -25,7 +25,7 @@ from rsa_vision.detect.balls.find import (
 from rsa_vision.detect.balls.fits import BallFits, ball_image, slopes
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import pairs_within
 from rsa_vision.detect.models.profiles import Optics, ball_table
 from rsa_vision.types import Bool, Float, Int
 
@@ -232,8 +232,8 @@ def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Floa
 
 def _within_others(seeds: BallFits) -> Bool:
     """Say which lie within the images of far surer ones: slopes of large balls look like small balls, in less noise than beside."""
-    gap = gaps(seeds.position_px, seeds.position_px)
-    return np.asarray(((gap < seeds.radius_px) & (seeds.significance > _SURER * seeds.significance[:, None])).any(axis=1))
+    one, other = pairs_within(seeds.position_px, seeds.position_px, seeds.radius_px)
+    return np.isin(np.arange(len(seeds.depth)), one[seeds.significance[other] > _SURER * seeds.significance[one]])
 
 
 def _much_more_noise(seeds: BallFits, noise: NoiseModel) -> bool:

@@ -12,7 +12,7 @@ from rsa_vision.detect.balls.find import plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import Box, box_of
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import are_within
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.painted import Painted, paint
@@ -64,8 +64,9 @@ def find_beaded(
     if not more and not lapped(real, balls, optics).any():
         return None
     now = paint([(f, pin_optics) for f in [*pins, *more]])
-    left = ~_are_these(balls, on_them) & ~(over_arms(balls, now) & now.explain(film, balls.position_px, balls.radius_px))
-    balls = join([balls.rows(left), on_them])
+    left = balls.rows(~are_within(balls.position_px, on_them.position_px, on_them.radius_px))
+    left = left.rows(~(over_arms(left, now) & now.explain(film, left.position_px, left.radius_px)))
+    balls = join([left, on_them])
     beside = BallsBeside(all_but(balls, np.arange(0), optics, None), balls, optics)
     fitted, pin_optics = fit_beside_balls(film, [*pins, *more], beside, optics, pin_optics, noise)
     return (fitted, pin_optics) if all(_is_there(f, fitted) for f in pins) else None
@@ -153,9 +154,3 @@ def _one_of(
             both = part(film, way, balls, optics, pin_optics, noise, others, is_one, balls.position_px[k])
             found += [both] if both else []
     return min((one for one in found if is_one(one[0])), key=lambda one: unexplained(one[0]), default=None)
-
-
-def _are_these(balls: BallFits, others: BallFits) -> Bool:
-    """Say which balls are others, as they were before."""
-    gap = gaps(balls.position_px, others.position_px)
-    return np.asarray((gap < others.radius_px).any(axis=1))

@@ -16,7 +16,7 @@ from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
 from rsa_vision.detect.balls.unlike import of_odd_size
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import are_within, gaps
 from rsa_vision.detect.marks.beaded import find_beaded
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.marks.noise_curve import noise_by_value
@@ -172,8 +172,7 @@ def _seen(needles: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
 def _long_places(mine: Candidates, looks: BallFits) -> Float:
     """Places (n, 2) at which the search answers along a line, likeliest first, less those at balls."""
     places, balls = _likeliest_first(mine.rows(mine.roundness < ROUNDNESS)), looks.rows(looks.explained > CLOSE)
-    gap = gaps(places, balls.position_px)
-    return np.asarray(places[(gap > _BESIDE[0] * balls.radius_px + _BESIDE[1]).all(axis=1)])
+    return np.asarray(places[~are_within(places, balls.position_px, _BESIDE[0] * balls.radius_px + _BESIDE[1])])
 
 
 def _likeliest_first(candidates: Candidates) -> Float:
@@ -324,7 +323,8 @@ def _measured(
     touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, touching, poor, rowed = balls.rows(keep), ratio[keep], touching[keep], poor[keep], around.rowed[keep]
     added = added[np.append(keep, np.ones(len(others), bool))]
-    poor = rowed | np.asarray(lapping_balls(balls)[:, poor].any(axis=1))  # what one of them leaves may be another's
+    one, other = lapping_balls(balls)
+    poor |= rowed | np.isin(np.arange(len(poor)), one[poor[other]])  # what one of them leaves may be another's
     doubtful = rowed | like_those_in_rows(balls.position_px, balls.radius_px, balls.depth, rowed, poor)
     doubtful |= in_bars(balls.position_px, balls.radius_px, balls.depth)
     doubtful |= cut_from_outlines(touching, ends[keep]) | are_holes(film, balls, optics.sigma_px)

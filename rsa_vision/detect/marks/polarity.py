@@ -15,7 +15,7 @@ from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import BESIDE_NEEDLES, noise_at_marks
 from rsa_vision.detect.balls.optics import CAP, ball_evidence, estimate_optics
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import are_within
 from rsa_vision.detect.marks.pairs import optics_of_pairs
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
@@ -158,8 +158,7 @@ def _of_tees(candidates: Candidates, sign: int) -> float:
 
 def _at_junctions(position_px: Float, junctions: Float) -> Bool:
     """Say which places may lie on the arms of tees."""
-    gap = gaps(position_px, junctions[:, :2])
-    return np.asarray((gap < _REACH * junctions[:, 3]).any(axis=1))
+    return are_within(position_px, junctions[:, :2], _REACH * junctions[:, 3])
 
 
 def _of_arms(strokes: Float, sign: int) -> float:

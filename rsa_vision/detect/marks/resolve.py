@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls.decide import LEAST_KNOWN, hopeless, look_clear
 from rsa_vision.detect.balls.find import CHANCE, COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
@@ -16,11 +14,11 @@ from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.balls.usual import over_kinds
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.places import gaps, on_film
+from rsa_vision.detect.film.places import are_within, gaps, on_film
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
-from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, all_but, deep_at, groups_of, images_beside, lapping_balls
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, all_but, deep_at, groups_of, heaps_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.blobs import split_blobs
 from rsa_vision.detect.neighbours.crowds import resolve_crowds
 from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
@@ -241,18 +239,20 @@ def perhaps_two(fits: BallFits, known: BallFits, noise: NoiseModel) -> Bool:
 
 def _in_one_beam(fits: BallFits) -> Bool:
     """Say whose shadow lies over that of another ball."""
-    return np.asarray((lapping_balls(fits) & ~np.eye(len(fits.depth), dtype=bool)).any(axis=1))
+    return np.isin(np.arange(len(fits.depth)), lapping_balls(fits)[0])
 
 
 def _bar(fits: BallFits, close: Bool) -> Bool:
     """Say which of those in one beam are no balls: two explain much, so they must explain it closely; between two that do not is a bar."""
-    partners = lapping_balls(fits) & ~np.eye(len(fits.depth), dtype=bool)
-    return np.asarray((partners.any(axis=1) & ~close) | ((partners & ~close).sum(axis=1) > 1))
+    one, other = lapping_balls(fits)
+    partners, poor = (np.bincount(of, minlength=len(close)) for of in (one, one[~close[other]]))
+    return np.asarray(((partners > 0) & ~close) | (poor > 1))
 
 
 def _cancelled(fits: BallFits) -> Bool:
     """Say over which lies one of the other polarity: together they may explain anything."""
-    return np.asarray((lapping_balls(fits) & (np.sign(fits.depth)[:, None] != np.sign(fits.depth))).any(axis=1))
+    one, other = lapping_balls(fits)
+    return np.isin(np.arange(len(fits.depth)), one[np.sign(fits.depth[one]) != np.sign(fits.depth[other])])
 
 
 def doubt_of_number(fits: BallFits) -> Float:
@@ -270,13 +270,8 @@ def doubt_of_number(fits: BallFits) -> Float:
         Zero for single balls, for pairs, and where all are beyond doubt.
     """
     out = np.zeros((len(fits.depth), 2, 2))
-    if len(out) == 0:
-        return out
-    lapping: Any = lapping_balls(fits)
-    _, label = connected_components(csr_array(lapping), directed=False)
-    for k in np.flatnonzero(np.bincount(label) > 2):
-        members = np.flatnonzero(label == k)
-        if fits.significance[members].min() < SURE:
+    for members in heaps_of(fits):
+        if len(members) > 2 and fits.significance[members].min() < SURE:
             apart = fits.position_px[members][:, None] - fits.position_px[members]
             nearest = (np.hypot(*apart.transpose(2, 0, 1)) + 1e9 * np.eye(len(members))).argmin(axis=1)
             half = 0.5 * apart[np.arange(len(members)), nearest]
@@ -286,8 +281,7 @@ def doubt_of_number(fits: BallFits) -> Float:
 
 def _taken(fits: BallFits, good: BallFits) -> Bool:
     """Say which fits lie on a ball that is already known."""
-    gap = gaps(fits.position_px, good.position_px)
-    return np.asarray((gap < 0.6 * good.radius_px[None]).any(axis=1))
+    return are_within(fits.position_px, good.position_px, 0.6 * good.radius_px)
 
 
 def _one_for_all(fits: BallFits, members: Int, noise: NoiseModel) -> list[int]:
@@ -331,7 +325,7 @@ def _unexplained_pairs(
     fine, peaks = fine[deep], peaks[deep]
     if len(peaks) == 0:
         return []
-    free = (gaps(peaks, good.position_px) > np.maximum(0.6 * typical, 0.9 * good.radius_px)).all(1)
+    free = ~are_within(peaks, good.position_px, np.maximum(0.6 * typical, 0.9 * good.radius_px))
     out = []
     used = np.zeros(len(peaks), bool)
     for i in np.nonzero(free)[0]:

@@ -25,7 +25,7 @@ from rsa_vision.detect.balls.find import (
 )
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.places import gaps, on_film
+from rsa_vision.detect.film.places import are_within, on_film
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
@@ -179,5 +179,4 @@ def _like_a_ball(fits: BallFits, limit: float, noise: NoiseModel, slack: float =
 
 
 def _near(position_px: Float, balls: BallFits, radius_px: float) -> Bool:
-    gap = gaps(position_px, balls.position_px)
-    return np.asarray((gap < np.maximum(radius_px, balls.radius_px)).any(axis=1))
+    return are_within(position_px, balls.position_px, np.maximum(radius_px, balls.radius_px))

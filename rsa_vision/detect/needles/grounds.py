@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from rsa_vision.detect.balls.surroundings import Places, around_each
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import are_within
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.needles.crossing import Window
@@ -72,7 +72,7 @@ def errors_by_ground(
         corner = np.rint([window.cols.min(), window.rows.min()] + span * round_about).astype(np.intp)
         centre = corner + 0.5 * size
         free = (corner >= 0).all(axis=1) & (corner + size <= film.shape[::-1]).all(axis=1)
-        free &= (gaps(centre, middle) > 0.5 * (span + across)).all(axis=1)
+        free &= ~are_within(centre, middle, 0.5 * (span + across))
         boxes = [film[row : row + size[1], col : col + size[0]] for col, row in corner[free]]
         values = np.array([box.ravel().take(window.place) for box in boxes], np.float64).reshape(len(boxes), len(window.place))
         # what lies over tees is blotted out while those under it are fitted; what is saturated shows no bone

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.balls.optics import CAP
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import are_within
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
@@ -240,7 +240,7 @@ def _models(junctions: Float, fitted_at: AtJunction) -> tuple[list[NeedleFit], l
         if not rough or _mean_misfit(rough) < CLEAN:
             break
         tips = np.array([f.position_px for f in rough])  # what is nearly a tee of one taper is where there are tees of another
-        order = order[(gaps(order[:, :2], tips) < _SAME_JUNCTION * order[:, 3:4]).any(axis=1)]
+        order = order[are_within(order[:, :2], tips, 0.0, _SAME_JUNCTION * order[:, 3])]
     if not rough or not is_tee(rough[0], slack=1.5):
         return [], []  # crossings of other things: not one is nearly a tee
     rough = [f for f in rough if f.shape.taper == best_taper]

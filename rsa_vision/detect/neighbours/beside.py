@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.balls.fits import BallFits, ball_image
 from rsa_vision.detect.film.patches import Box
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import pairs_within
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.types import Bool, Float, Int
@@ -22,19 +22,23 @@ MOST_IN_GROUP = 5
 
 def groups_of(fits: BallFits, optics: Optics) -> list[list[int]]:
     """Sets of balls whose images touch."""
+    return heaps_of(fits, TOUCH * optics.sigma_px)
+
+
+def heaps_of(fits: BallFits, apart_px: float = 0.0) -> list[list[int]]:
+    """Sets of balls whose shadows lie over each other, or less than this apart, from one to the next."""
     n = len(fits.depth)
     if n == 0:
         return []
-    gap = gaps(fits.position_px, fits.position_px)
-    touch: Any = gap < fits.radius_px[:, None] + fits.radius_px[None] + TOUCH * optics.sigma_px
-    _, label = connected_components(csr_array(touch), directed=False)
+    one, other = lapping_balls(fits, apart_px)
+    _, label = connected_components(coo_array((np.ones(len(one)), (one, other)), shape=(n, n)), directed=False)
     return [np.nonzero(label == k)[0].tolist() for k in range(label.max() + 1)]
 
 
-def lapping_balls(fits: BallFits) -> Bool:
-    """Say whose shadows lie over each other, shape (n, n); each over its own."""
-    gap = gaps(fits.position_px, fits.position_px)
-    return np.asarray(gap < fits.radius_px[:, None] + fits.radius_px[None])
+def lapping_balls(fits: BallFits, apart_px: float = 0.0) -> tuple[Int, Int]:
+    """Return which balls have shadows that lie over which others, or less than this apart: each pair of them either way round."""
+    one, other = pairs_within(fits.position_px, fits.position_px, fits.radius_px + apart_px, fits.radius_px)
+    return one[one != other], other[one != other]
 
 
 def all_but(known: BallFits, members: Int, optics: Optics, needles: Images | None) -> Images:

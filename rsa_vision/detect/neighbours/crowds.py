@@ -12,10 +12,10 @@ from rsa_vision.detect.balls.decide import LEAST_KNOWN, look_clear
 from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, MISFIT, fit_at, misfit, plausible
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import are_within, gaps
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
-from rsa_vision.detect.neighbours.beside import all_but, deep_at
+from rsa_vision.detect.neighbours.beside import all_but, deep_at, lapping_balls
 from rsa_vision.detect.neighbours.blobs import LEAST_APART, STRETCH, long_axis
 from rsa_vision.detect.neighbours.group_images import images_in, window_around
 from rsa_vision.detect.neighbours.groups import fit_group
@@ -64,8 +64,7 @@ def resolve_crowds(
     BallFits
         Those found, and the balls of crowds.
     """
-    apart = gaps(found.position_px, found.position_px)
-    alone = (apart < found.radius_px[:, None] + found.radius_px + _ROOM * optics.sigma_px).sum(axis=1) == 1
+    alone = ~np.isin(np.arange(len(found.depth)), lapping_balls(found, _ROOM * optics.sigma_px)[0])
     known = found.rows(look_clear(found, noise) & alone)
     if len(known.depth) < LEAST_KNOWN:
         return found
@@ -76,8 +75,7 @@ def resolve_crowds(
         return others(cols, rows), np.zeros(cols.shape, bool)
 
     place = candidates.position_px
-    gap = gaps(place, found.position_px)
-    place = place[(gap > found.radius_px + 0.6 * radius).all(axis=1)]
+    place = place[~are_within(place, found.position_px, found.radius_px + 0.6 * radius)]
     place = place[deep_at(film, place, radius, needles) > _DEEP * abs(depth)]
     if len(place) == 0:
         return found
@@ -103,8 +101,7 @@ def resolve_crowds(
 
 def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics, noise: NoiseModel, needles: Images | None) -> BallFits:
     """Put a crowd to the balls found, fitted again together with those that it laps over."""
-    gap = gaps(found.position_px, crowd.position_px)
-    near = (gap < found.radius_px[:, None] + crowd.radius_px).any(axis=1)
+    near = are_within(found.position_px, crowd.position_px, crowd.radius_px, found.radius_px)
     if near.any():
         start = join([found.rows(near), crowd])
         others = all_but(found, np.flatnonzero(near), optics, needles)

@@ -14,7 +14,7 @@ from rsa_vision.detect.balls.find import distinct, no_fits
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import weighted_least_squares
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import are_within
 from rsa_vision.detect.models.lapping import fine_places
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
@@ -178,13 +178,13 @@ def look_on_arms(
     usual, depth = float(np.median(clear.radius_px)), float(np.median(np.abs(clear.depth)))
     sizes = np.full(len(place), usual)
     place = place[(painted.under(place, sizes) > OVER * depth) & ~painted.explain(film, place, sizes)]
-    place = place[(gaps(place, known.position_px) > usual).all(axis=1)]
+    place = place[~are_within(place, known.position_px, usual)]
     starts = _apart(place, _APART * usual)
     balls = fit_over(film, starts, np.full(len(starts), usual), known, optics, noise, painted)
     deep = np.sign(np.median(clear.depth)) * balls.depth > _DEEP * depth
     stays = np.hypot(*(balls.position_px - starts).T) < _STAYS * usual
-    free = (gaps(balls.position_px, known.position_px) > usual).all(axis=1)
-    return distinct(balls.rows(like_clear(balls, known, limit, noise) & deep & stays & free), noise)
+    taken = are_within(balls.position_px, known.position_px, usual)
+    return distinct(balls.rows(like_clear(balls, known, limit, noise) & deep & stays & ~taken), noise)
 
 
 def _apart(place: Float, gap_px: float) -> Float:

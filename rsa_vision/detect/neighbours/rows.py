@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.film.places import are_within, pairs_within
 from rsa_vision.types import Bool, Float, Int
 
 _ROW = 5  # at least so many in line, one as far from the next as all others
@@ -96,10 +96,10 @@ def like_those_in_rows(position_px: Float, radius_px: Float, depth: Float, rowed
     out = np.zeros(len(depth), bool)
     perhaps = np.flatnonzero(~rowed)
     perhaps = perhaps[like(perhaps, rowed).sum(axis=1) >= _KIN]
-    reach_px = 2 * _SCREW * radius_px[perhaps, None]
-    found = (gaps(position_px[perhaps], position_px[rowed]) < reach_px).any(axis=1)
-    near = gaps(position_px[perhaps], position_px[perhaps]) < reach_px
-    while (more := ~found & near[:, found].any(axis=1)).any():  # from one to the next along the screw
+    place, reach_px = position_px[perhaps], 2 * _SCREW * radius_px[perhaps]
+    found = are_within(place, position_px[rowed], 0.0, reach_px)
+    one, other = pairs_within(place, place, 0.0, reach_px)
+    while (more := ~found & np.isin(np.arange(len(found)), one[found[other]])).any():  # from one to the next along the screw
         found |= more
     of_screw = rowed.copy()
     of_screw[perhaps[found]] = True
@@ -122,11 +122,11 @@ def in_bars(position_px: Float, radius_px: Float, depth: Float) -> Bool:
     ndarray of bool, shape (n,)
     """
     out = np.zeros(len(depth), bool)
-    gap = gaps(position_px, position_px)
-    lap = (gap < radius_px[:, None] + radius_px) & (gap > 0) & _alike(radius_px[:, None], radius_px, _LIKE_SIZE)
-    lap &= _alike(depth[:, None], depth, _LIKE_DEPTH)
-    for middle in np.flatnonzero(lap.sum(axis=1) >= 2):
-        beside = np.flatnonzero(lap[middle])
+    one, other = pairs_within(position_px, position_px, radius_px, radius_px)
+    like = (one != other) & _alike(radius_px[one], radius_px[other], _LIKE_SIZE) & _alike(depth[one], depth[other], _LIKE_DEPTH)
+    begin, end = one[like], other[like]
+    for middle in np.flatnonzero(np.bincount(begin, minlength=len(out)) >= 2):
+        beside = end[begin == middle]
         both = position_px[beside, None] + position_px[beside] - 2 * position_px[middle]
         one, other = np.nonzero(np.hypot(*both.transpose(2, 0, 1)) < 2 * _OFF_LINE * radius_px[middle])
         if (one != other).any():
