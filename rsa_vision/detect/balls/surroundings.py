@@ -14,6 +14,7 @@ from rsa_vision.detect.balls.alike import robust_sd
 from rsa_vision.detect.balls.fits import BallFits, half_size
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
+from rsa_vision.detect.film.places import pairs_within
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float, Int
 
@@ -23,6 +24,7 @@ _DEGREES = range(3, 7)  # of surfaces beyond the quadratic one; finer ones do no
 _LEAST_DIFFER = 0.2  # of structure from window to window
 _LEAST = 4  # free places from which a ball's surroundings tell something
 _SURE = 2.0  # standard deviations
+_DIAGONAL = 1.5  # of a square, and more than that, over its side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,9 +99,12 @@ def free_places(film: NDArray[Any], balls: BallFits, others_px: Float, reach_px:
         nearest = half + balls.radius_px[index] + 3 * optics.sigma_px
         distance = nearest[:, None] * np.repeat(_FARTHER, len(_DIRECTIONS))
         place = balls.position_px[index, None] + distance[:, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        gap = np.maximum(*(np.abs(place[:, :, None, k] - marks[:, k]) for k in (0, 1)))
-        ball, where = np.nonzero((gap > half + reach).all(axis=2))
-        patches = cut(film, place[ball, where], int(half), noise)
+        place = place.reshape(-1, 2)
+        one, mark = pairs_within(place, marks, _DIAGONAL * (half + reach))
+        taken = one[np.abs(place[one] - marks[mark]).max(axis=1) <= half + reach[mark]]
+        free = np.setdiff1d(np.arange(len(place)), taken)
+        ball = free // len(angle)
+        patches = cut(film, place[free], int(half), noise)
         whole = patches.valid.all(axis=(1, 2))
         values = patches.values[whole].reshape(-1, patches.size**2).astype(film.dtype)
         out.append(Places(int(half), index, ball[whole], patches.corner_px[whole] // patches.size, values))
