@@ -26,7 +26,7 @@ _KERNEL, _UNBLURRED = 4.5, np.ones(1, np.float32)  # standard deviations to whic
 _PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=256)
 def _opacity(
     half_width: float,
     length: float,
