@@ -18,8 +18,9 @@ from rsa_vision.detect.film.places import pairs_within
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float, Int
 
-_DIRECTIONS = 2 * np.pi * np.arange(8) / 8
-_FARTHER = (1.0, 1.5, 2.2)  # distances, in units of the nearest one that is free of the ball
+_WAYS = (2 * np.pi * np.arange(8) / 8 + np.arange(3)[:, None] * np.pi / 8).ravel()
+# three rings of places, in units of the nearest distance that is free of the mark in their middle, (col, row)
+ROUND_ABOUT = np.repeat([1.0, 1.5, 2.2], 8)[:, None] * np.stack([np.cos(_WAYS), np.sin(_WAYS)], axis=1)
 _DEGREES = range(3, 7)  # of surfaces beyond the quadratic one; finer ones do not look like a shift of the ball
 _LEAST_DIFFER = 0.2  # of structure from window to window
 _LEAST = 4  # free places from which a ball's surroundings tell something
@@ -92,18 +93,15 @@ def free_places(film: NDArray[Any], balls: BallFits, others_px: Float, reach_px:
     marks = np.concatenate([balls.position_px, others_px])
     reach = np.concatenate([balls.radius_px + 3 * optics.sigma_px, reach_px])
     halves = np.array([half_size(r, optics.sigma_px) for r in balls.radius_px])
-    angle = np.tile(_DIRECTIONS, len(_FARTHER)) + np.repeat(np.arange(len(_FARTHER)), len(_DIRECTIONS)) * np.pi / 8
     out = []
     for half in np.unique(halves):
         index = np.nonzero(halves == half)[0]
         nearest = half + balls.radius_px[index] + 3 * optics.sigma_px
-        distance = nearest[:, None] * np.repeat(_FARTHER, len(_DIRECTIONS))
-        place = balls.position_px[index, None] + distance[:, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        place = place.reshape(-1, 2)
+        place = (balls.position_px[index, None] + nearest[:, None, None] * ROUND_ABOUT).reshape(-1, 2)
         one, mark = pairs_within(place, marks, _DIAGONAL * (half + reach))
         taken = one[np.abs(place[one] - marks[mark]).max(axis=1) <= half + reach[mark]]
         free = np.setdiff1d(np.arange(len(place)), taken)
-        ball = free // len(angle)
+        ball = free // len(ROUND_ABOUT)
         patches = cut(film, place[free], int(half), noise)
         whole = patches.valid.all(axis=(1, 2))
         values = patches.values[whole].reshape(-1, patches.size**2).astype(film.dtype)

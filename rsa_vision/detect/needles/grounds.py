@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from rsa_vision.detect.balls.surroundings import Places, around_each
+from rsa_vision.detect.balls.surroundings import ROUND_ABOUT, Places, around_each
 from rsa_vision.detect.film.places import are_within
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit
@@ -17,9 +17,7 @@ from rsa_vision.detect.needles.crossing import Window
 from rsa_vision.detect.needles.equations import Equations
 from rsa_vision.types import Float
 
-_DIRECTIONS = 2 * np.pi * np.arange(8) / 8
 _ENOUGH, _SPARSEST = 400, 3  # places of a film, from which only every second or third around each is looked at
-_FARTHER = (1.0, 1.5, 2.2)  # distances, in units of the size of the window
 _MEDIAN = float(chdtri(1.0, 0.5))  # of a square of variance one
 _LEAST = 0.1  # of what noise does, of which less is none
 
@@ -62,9 +60,7 @@ def errors_by_ground(
     way = np.array([f.way for f in members])
     axes = np.stack([way, np.stack([-way[:, 1], way[:, 0]], axis=1)], axis=1)  # (members, 2, 2)
     counts = np.cumsum([0] + [len(e.members) for e in systems])
-    angle = np.tile(_DIRECTIONS, len(_FARTHER)) + np.repeat(np.arange(len(_FARTHER)), len(_DIRECTIONS)) * np.pi / 8
-    round_about = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.repeat(_FARTHER, len(_DIRECTIONS))[:, None]
-    round_about = round_about[:: max(1, min(len(round_about) * len(members) // _ENOUGH, _SPARSEST))]
+    round_about = ROUND_ABOUT[:: max(1, min(len(ROUND_ABOUT) * len(members) // _ENOUGH, _SPARSEST))]
     places, figures, variances = [], [], []
     for window, e, scatter, first in zip(windows, systems, by_noise, counts, strict=False):
         mine = slice(first, first + len(e.members))
