@@ -18,7 +18,7 @@ from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles import shared, tees
 from rsa_vision.detect.needles.arms import perhaps_arms
-from rsa_vision.detect.needles.ends import goes_on
+from rsa_vision.detect.needles.ends import arms_go_on
 from rsa_vision.detect.needles.noise_along import noise_under_needles
 from rsa_vision.detect.needles.optics import GUESS
 from rsa_vision.detect.needles.tees import find_tees, first_tees, is_tee, optics_of_tees
@@ -55,9 +55,9 @@ def test_arms_that_go_on_beyond_their_ends_are_wires(reach: float, on: bool) -> 
     film = np.rint(40000 - 20000 * gaussian_filter(bars.astype(float), SIGMA_PX)).astype(np.uint16)
     angles, shape = np.array([-np.pi / 2, 0.0, np.pi]), NeedleShape(2.0, 17.0)
     fit = replace(_TEE, position_px=np.array([60.0, 60.0]), angles=angles, shape=shape)
-    assert goes_on(film, fit, Optics(SIGMA_PX, 0.5), None) == on
+    assert arms_go_on(film, fit, Optics(SIGMA_PX, 0.5), None) == on
     film[:, np.abs(cols[0]) > 17] = 40000
-    assert not goes_on(film, fit, Optics(SIGMA_PX, 0.5), None)  # one arm may point at something by chance
+    assert not arms_go_on(film, fit, Optics(SIGMA_PX, 0.5), None)  # one arm may point at something by chance
 
 
 def test_balls_are_not_faint_beside_thin_needles() -> None:

@@ -29,7 +29,7 @@ DOUBTFUL = 0.6  # of it: more may be two balls, or something else
 ANYTHING = 6.0  # times the misfit that is tolerated otherwise, which pairs leave that hardly lap
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
 EXPLAINED = 0.9
-PROMISING = 0.85  # of the significance a mark must have: better fits are 3 % more significant mostly, 10 % at the most
+_PROMISING = 0.85  # of the significance a mark must have: better fits are 3 % more significant mostly, 10 % at the most
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
 _CAP, _CAP_MISFIT, _CAP_SURE = 0.4, 0.03, 20.0  # of a ball seen, that is enough if it leaves so little and stands out so far
 _CAP_PIXELS = 12  # of such a one, if nothing beside it is seen
@@ -156,7 +156,7 @@ def promising(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     -------
     ndarray of bool, shape (n,)
     """
-    return np.asarray(in_correlated_noise(fits, sigma_px, noise) > PROMISING * limit)
+    return np.asarray(in_correlated_noise(fits, sigma_px, noise) > _PROMISING * limit)
 
 
 def explained_over_noise(fits: BallFits) -> Float:

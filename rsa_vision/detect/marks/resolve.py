@@ -21,7 +21,7 @@ from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, all_but, deep_at, groups_of, heaps_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.blobs import split_blobs
 from rsa_vision.detect.neighbours.crowds import resolve_crowds
-from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
+from rsa_vision.detect.neighbours.edges import NEAR_EDGES, balls_beside_edges
 from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.detect.neighbours.lines import without_lines
 from rsa_vision.detect.neighbours.not_round import are_not_round
@@ -186,7 +186,7 @@ def resolve_balls(
     found = resolve_crowds(film, candidates, distinct(found, noise), optics, noise, beside)
     found = join([found, perhaps.rows(~_in_one_beam(join([perhaps, found]))[: len(perhaps.depth)])])
     found = without_lines(film, distinct(found, noise), limit, optics, noise, beside)
-    found, edged = beside_edges(film, found, optics, noise, beside)
+    found, edged = balls_beside_edges(film, found, optics, noise, beside)
     balls = plausible(found, noise)
     found, edged = found.rows(balls), edged[balls]
     of_spot, at_edge = _drawn_beside_edges(film, drawn, optics, noise, needles)
@@ -202,11 +202,11 @@ def resolve_balls(
 def _drawn_beside_edges(
     film: NDArray[Any], drawn: Drawn, optics: Optics, noise: NoiseModel, needles: Painted | None
 ) -> tuple[BallFits, Bool]:
-    """Fit again, as :func:`beside_edges`, those that surely are single balls drawn by the spot."""
+    """Fit again, as :func:`balls_beside_edges`, those that surely are single balls drawn by the spot."""
     parts, edged = [drawn.fits.rows(slice(0))], drawn.doubtful.copy()
     for i, doubtful in enumerate(drawn.doubtful):
         one, others = drawn.fits.rows([i]), with_spot(needles, drawn.fits.rows(np.arange(len(edged)) != i), drawn.spot, optics)
-        fits, at_edge = (one, [False]) if doubtful else beside_edges(film, one, optics, noise, others, drawn.spot)
+        fits, at_edge = (one, [False]) if doubtful else balls_beside_edges(film, one, optics, noise, others, drawn.spot)
         parts.append(fits)
         edged[i] = at_edge[0]
     return join(parts), edged

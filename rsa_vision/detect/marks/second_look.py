@@ -31,7 +31,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.beside import all_but, images_beside
 from rsa_vision.detect.neighbours.crossed import without_scratches
-from rsa_vision.detect.neighbours.edges import NEAR_EDGES, beside_edges
+from rsa_vision.detect.neighbours.edges import NEAR_EDGES, balls_beside_edges
 from rsa_vision.detect.neighbours.lines import balls_on_lines, on_lines
 from rsa_vision.detect.search.candidates import SCALES, STRENGTH, Candidates
 from rsa_vision.types import Bool, Float
@@ -138,7 +138,7 @@ def _of_the_usual_size(look: _Look, place: Float, balls: BallFits) -> tuple[Ball
     enough = over_clutter(fits) > _CLEAR * limit
     fits = distinct(fits.rows(stays & _like_a_ball(fits, limit, noise, NEAR_EDGES) & enough), noise)
     fits = fits.rows(~on_lines(film, join([balls, fits]), limit, optics, noise, needles)[len(balls.depth) :])
-    fits, edged = beside_edges(film, fits, optics, noise, look.beside(balls))
+    fits, edged = balls_beside_edges(film, fits, optics, noise, look.beside(balls))
     like = _like_a_ball(fits, limit, noise)
     return fits.rows(like), edged[like], rough
 
@@ -148,7 +148,7 @@ def _over_lines(look: _Look, place: Float, known: BallFits) -> BallFits:
     others, place = look.beside(known), place[~_near(place, known, look.usual)]
     fits = balls_on_lines(look.film, place, look.usual, look.limit, look.optics, look.noise, others)
     fits = distinct(fits.rows(look.may_be(fits, known) & plausible(fits, look.noise, NEAR_EDGES)), look.noise)
-    fits, edged = beside_edges(look.film, fits, look.optics, look.noise, others, wanted=lambda some: look.sure(some, known))
+    fits, edged = balls_beside_edges(look.film, fits, look.optics, look.noise, others, wanted=lambda some: look.sure(some, known))
     return fits.rows(edged & look.sure(fits, known))
 
 
@@ -161,7 +161,7 @@ def _at_rims(look: _Look, rough: BallFits, known: BallFits) -> BallFits:
     def wanted(fits: BallFits) -> Bool:
         return np.asarray((np.abs(fits.depth) > least) & look.may_be(fits, known) & look.sure(fits, known))
 
-    fits, edged = beside_edges(look.film, rough, look.optics, look.noise, look.beside(known), wanted=wanted)
+    fits, edged = balls_beside_edges(look.film, rough, look.optics, look.noise, look.beside(known), wanted=wanted)
     return distinct(fits.rows(edged & wanted(fits)), look.noise)
 
 

@@ -30,7 +30,7 @@ _FEWEST = 60  # pixels beside arms that tell: ten times the terms of a surface
 _ROUNDS = 2  # of estimates of the proportion, from the edges that it makes better understood
 
 
-def beside_edges(
+def tees_beside_edges(
     film: NDArray[Any], tees: list[NeedleFit], optics: Optics, noise: NoiseModel, is_tee: Callable[[NeedleFit], bool]
 ) -> tuple[list[NeedleFit], Optics]:
     """Fit again, with an edge in the background, the tees that leave more than noise where the film beside them is uneven.

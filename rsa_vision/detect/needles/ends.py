@@ -19,7 +19,7 @@ _AS_HIGH = 0.7  # of that
 _FURTHER_PX = np.arange(1.0, 5.0)
 
 
-def goes_on(film: NDArray[Any], tee: NeedleFit, optics: Optics, others: Images | None) -> bool:
+def arms_go_on(film: NDArray[Any], tee: NeedleFit, optics: Optics, others: Images | None) -> bool:
     """Say whether two arms of a tee at least are as high beyond their ends as on them: one may point at something by chance.
 
     Parameters

@@ -65,7 +65,7 @@ def look_for_pins(film: NDArray[Any], strokes: Float, noise: NoiseModel) -> list
             in_vain = 0
         if in_vain == _MOST_IN_VAIN:
             break
-    return distinct(found)
+    return distinct_pins(found)
 
 
 def _either_way(film: NDArray[Any], stroke: Float, optics: Optics, noise: NoiseModel) -> NeedleFit:
@@ -111,10 +111,10 @@ def likest_pins(film: NDArray[Any], places: Float, sign: int, noise: NoiseModel)
         best = max(fits, key=lambda f: f.explained)
         if explains(best, _ROUGH, STANDS_OUT_ROUGHLY) and best.depth * sign > 0:
             out.append(best_tapered(film, best, noise))
-    return distinct(out)
+    return distinct_pins(out)
 
 
-def distinct(pins: list[NeedleFit]) -> list[NeedleFit]:
+def distinct_pins(pins: list[NeedleFit]) -> list[NeedleFit]:
     """Return one fit of every pin, best first."""
     kept: list[NeedleFit] = []
     for fit in sorted(pins, key=unexplained):

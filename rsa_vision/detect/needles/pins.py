@@ -16,7 +16,7 @@ from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
-from rsa_vision.detect.needles.first_pins import best_tapered, distinct, likest_pins
+from rsa_vision.detect.needles.first_pins import best_tapered, distinct_pins, likest_pins
 from rsa_vision.detect.needles.fits import between, excess_of, fit_needles, significant_misfit
 from rsa_vision.detect.needles.of_a_kind import are_alike, are_as_thick, are_of_a_kind, odd_lengths, others_like, without_company
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
@@ -88,7 +88,7 @@ def find_pins(
     if tees or are_of_a_kind(found[0]):
         return found
     rough = [best_tapered(film, f, noise) for f in rough] + likest_pins(film, long_places, sign, noise)
-    if not are_alike([f for f in distinct(rough) if is_pin(f, noise)]):
+    if not are_alike([f for f in distinct_pins(rough) if is_pin(f, noise)]):
         return found
     trials = [optics, *(replace(optics, sigma_px=sigma) for sigma in _OTHER_BLURS_PX)]
     more = _found_from(film, rough, places, tees, sign, trials, noise)
@@ -102,7 +102,7 @@ def _found_from(
     """Find pins from first looks; ``trials``: what the film is known to be like, and what else it may be."""
     known = trials[0]
     on_tees = on_arms(np.array([middle(f) for f in rough]).reshape(-1, 2), tees)
-    rough = distinct([f for f, on in zip(rough, on_tees, strict=True) if not on])
+    rough = distinct_pins([f for f, on in zip(rough, on_tees, strict=True) if not on])
     if not rough:
         return [], known
     optics, taper, sample = _likeliest(film, rough[:_SAMPLE], trials, noise)
@@ -121,11 +121,11 @@ def _found_from(
     if len(trials) > 1:  # optics were guessed at first: whichever way round a pin began says little
         fits = [[*ways, *(_refit_turned(film, f, even, noise) for f in ways)] for ways in fits]
     best = [min(ways, key=unexplained) for ways in fits]
-    pins = pointed(film, distinct(_still(best, noise)), optics, noise)
+    pins = pointed(film, distinct_pins(_still(best, noise)), optics, noise)
     if len(pins) >= LEAST_OF_A_KIND:  # then there may be others, with as sharp a point on another length
         odd = [best_tapered(film, f, noise, even, tapers, quick=False) for f in best if not is_pin(f, noise, STANDS_OUT_ROUGHLY)]
-        others = pointed(film, distinct(_still(odd, noise)), optics, noise)
-        pins = distinct([*pins, *others]) if others else pins
+        others = pointed(film, distinct_pins(_still(odd, noise)), optics, noise)
+        pins = distinct_pins([*pins, *others]) if others else pins
     pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
     start = _without_what_they_told(optics, known)
     pins, optics = fit_shared(film, pins, start, noise, parallel=False, alike=True)

@@ -21,14 +21,14 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.covered import find_covered, uncovered
 from rsa_vision.detect.needles.crossing import chi2_of, fit_crossing, moved, window_of
-from rsa_vision.detect.needles.edges import beside_edges, proportion_of
-from rsa_vision.detect.needles.ends import goes_on
+from rsa_vision.detect.needles.edges import proportion_of, tees_beside_edges
+from rsa_vision.detect.needles.ends import arms_go_on
 from rsa_vision.detect.needles.fits import excess_of, explains, fit_needles
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
 from rsa_vision.detect.needles.pointed import unexplained
 from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles.shared import fit_shared
-from rsa_vision.detect.needles.templates import SCALE, find_like, promising, template_of
+from rsa_vision.detect.needles.templates import SCALE, find_like, template_of, worth_a_fit
 from rsa_vision.detect.needles.twins import split_twins
 from rsa_vision.detect.search.junctions import ALONE, RINGS_PX
 from rsa_vision.types import Float
@@ -122,13 +122,13 @@ def _found_from(
         return others_beside(mine, [t for t in around if all(t is not m for m in mine)], optics)
 
     tees = split_twins(film, tees, optics, noise, is_tee, others_of)
-    tees = [t for t in tees if not goes_on(film, t, optics, others_beside(t, [o for o in tees if o is not t], optics))]
+    tees = [t for t in tees if not arms_go_on(film, t, optics, others_beside(t, [o for o in tees if o is not t], optics))]
     if not tees:
         return [], [], optics
     # arms that are parallel on a cage stay so on a film, nearly; the tip is where lines along them meet: to know directions sharpens it
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     optics = replace(optics, proportion=proportion_of(film, nearly, optics))
-    tees, optics = beside_edges(film, tees, optics, noise, is_tee)
+    tees, optics = tees_beside_edges(film, tees, optics, noise, is_tee)
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
@@ -297,7 +297,7 @@ def _like(film: NDArray[Any], models: list[NeedleFit], turned: list[NeedleFit], 
     """Look at every place that looks like one of the models, and at tees that cannot, being turned against them."""
     found = [find_like(film, template_of(m, optics)) for m in models]
     # what brighter tees hide here is found once these are known
-    looks = [promising(film, places, m, optics, noise) for m, places in zip(models, found, strict=True)]
+    looks = [worth_a_fit(film, places, m, optics, noise) for m, places in zip(models, found, strict=True)]
     worth, step = (np.concatenate(of) for of in zip(*looks, strict=True))
     model, places = np.repeat(np.arange(len(models)), [len(f) for f in found]), np.concatenate(found)
     starts = list(turned)

@@ -93,7 +93,7 @@ def _without_slopes(image: NDArray[np.float32], side: int, border: int) -> NDArr
     return np.asarray(cv2.subtract(image, cv2.blur(image, (box, box), borderType=border)))
 
 
-def promising(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optics, noise: NoiseModel) -> tuple[Bool, Float]:
+def worth_a_fit(film: NDArray[Any], places: Float, known: NeedleFit, optics: Optics, noise: NoiseModel) -> tuple[Bool, Float]:
     """Say at which places the image of a known tee, on a quadratic background, explains a part of what lies under it.
 
     The first step from there to the best fit comes with it.

@@ -31,7 +31,7 @@ _CLEAR = 50.0  # significance of balls of which blur is seen so well
 _MORE_GAIN = 9.0  # the same of what balls take away of it, and of its bend: each makes what else is fitted less sure
 
 
-def beside_edges(
+def balls_beside_edges(
     film: NDArray[Any],
     fits: BallFits,
     optics: Optics,
