@@ -119,7 +119,7 @@ def resolve_balls(
     others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-    drawn = find_spot(film, single.rows(~clean), single.rows(clean), optics, noise, others)
+    drawn = find_spot(film, single.rows(~clean), single.rows(clean), optics, noise, needles)
     rest = ~_taken(single, drawn.fits)
     single, clean, beside = single.rows(rest), clean[rest], with_spot(beside, drawn.fits, drawn.spot, optics)
     good = single.rows(plausible(single, noise, slack=1.5))

@@ -13,7 +13,7 @@ from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import columns
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.models.shown import Beside
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.blobs import STRETCH, long_axis
 from rsa_vision.detect.neighbours.group_images import GroupWindow, images_in, window_around
 from rsa_vision.detect.neighbours.groups import fit_group
@@ -30,7 +30,7 @@ def gain_over_two(
     known: BallFits,
     optics: Optics,
     noise: NoiseModel,
-    others: Beside | None,
+    needles: Images | None,
 ) -> tuple[Float, Float]:
     """Compare each ball drawn by a spot with two balls like those of the film, fitted freely.
 
@@ -47,8 +47,8 @@ def gain_over_two(
         Clear balls: what two have to be like.
     optics : Optics
     noise : NoiseModel
-    others : callable, optional
-        As of :func:`rsa_vision.detect.balls.find.fit_at`.
+    needles : callable, optional
+        Images to be subtracted.
 
     Returns
     -------
@@ -58,7 +58,6 @@ def gain_over_two(
     half : ndarray of shape (n, 2)
         From the middle of the two to either, px.
     """
-    beside = None if others is None else lambda cols, rows: others(0, cols, rows)[0]
     size, depth = (_usual(value, variance) for value, variance in _sizes_and_depths(known))
     gain, half = np.zeros(len(drawn.depth)), np.zeros((len(drawn.depth), 2))
     for i in range(len(gain)):
@@ -66,8 +65,8 @@ def gain_over_two(
         start_radius = np.full(2, single.radius_px[i] if len(known.depth) == 0 else np.exp(size[0]))
         for stretch in STRETCH:
             start = single.position_px[i] + np.array([[-0.5], [0.5]]) * stretch * axis
-            two = fit_group(film, start, start_radius, optics.sigma_px, optics.mu_px, noise, beside)
-            window = window_around(film, two.position_px, two.radius_px, optics.sigma_px, noise, beside)
+            two = fit_group(film, start, start_radius, optics.sigma_px, optics.mu_px, noise, needles)
+            window = window_around(film, two.position_px, two.radius_px, optics.sigma_px, noise, needles)
             cols, rows = window.cols + window.corner_px[0], window.rows + window.corner_px[1]
             local = two.position_px - window.corner_px
             of_two = images_in(window, window.surface, local, two.radius_px, optics.sigma_px, optics.mu_px).linear

@@ -22,7 +22,7 @@ from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.profiles import Optics, ball_table
-from rsa_vision.detect.models.shown import Beside, Images, beside_each
+from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.blobs import LEAST_GAIN
 from rsa_vision.detect.neighbours.double_images import gain_over_two
 from rsa_vision.types import Bool, Float
@@ -87,7 +87,7 @@ class _State:
     linear: Float  # (n, 7): depth and background
 
 
-def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics, noise: NoiseModel, others: Beside | None) -> Drawn:
+def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics, noise: NoiseModel, needles: Images | None) -> Drawn:
     """Find the spot that explains odd images, and fit the balls that it explains.
 
     Parameters
@@ -99,8 +99,8 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
         Those that do not: a spot may have drawn some of them as well.
     optics : Optics
     noise : NoiseModel
-    others : callable, optional
-        ``others(i, cols, rows)``: images of neighbours, and where they are not to be trusted.
+    needles : callable, optional
+        Images to be subtracted.
 
     Returns
     -------
@@ -130,13 +130,13 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
     odd = odd.rows(np.argsort(-over_clutter(odd)))
     radius = float(np.median(odd.radius_px))
     half = half_size(radius, optics.sigma_px)
-    few = _window(film, odd.rows(slice(_MOST)), half, others, noise)
+    few = _window(film, odd.rows(slice(_MOST)), half, needles, noise)
     trials = []
     for angle in _STARTS:
         along = np.array([0.4 * radius * np.cos(angle), 0.4 * radius * np.sin(angle), 0.2 * radius, 0.0])
         trials.append(_fitted(few, _start(odd.rows(slice(_MOST)), few, along), _STEPS, optics, noise, radius))
     best, _ = min(trials, key=lambda trial: float(np.log(trial[1]).sum()))
-    window = _window(film, odd, half, others, noise)
+    window = _window(film, odd, half, needles, noise)
     state, _ = _fitted(window, _start(odd, window, best.along), _LAST_STEPS, optics, noise, radius)
     if abs(state.along[2]) < _ACROSS * np.hypot(*state.along[:2]):
         return nobody
@@ -146,10 +146,10 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
     kept = alike & plausible(fits, noise) & (rest < np.maximum(DOUBTFUL * MISFIT, _BETTER * before))
     if np.count_nonzero(kept & (rest < _BETTER * before)) < COMPANY:
         return nobody
-    more = _drawn_as_well(film, clean, state, kept, half, optics, noise, others)
+    more = _drawn_as_well(film, clean, state, kept, half, optics, noise, needles)
     better = np.append((rest < _BETTER * before)[kept], np.zeros(np.count_nonzero(more), bool))
     odd, sure = join([odd.rows(kept), clean.rows(more)]), clean.rows(~more & look_clear(clean, noise))
-    window = _window(film, odd, half, others, noise)
+    window = _window(film, odd, half, needles, noise)
     state, _ = _fitted(window, _start(odd, window, state.along), _LAST_STEPS, optics, noise, radius)
     fits, by_spot = _table(window, state, odd, optics, noise)
     spot = spot_of(state.along)
@@ -158,7 +158,7 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
         dx, dy = (axis[None] - middle for axis, middle in zip((cols, rows), fits.position_px[i], strict=True))
         return np.asarray(shapes_of(optics, spot, dx, dy, fits.radius_px[[i]])[0][0])
 
-    gain, apart = gain_over_two(film, fits, image, odd, sure, optics, noise, others)
+    gain, apart = gain_over_two(film, fits, image, odd, sure, optics, noise, needles)
     # pairs would have to lie the same way by chance, all of them: they are judged together, and none of them decides alone
     told = better & (gain > 0)
     if np.count_nonzero(told) < COMPANY or np.minimum(gain[told], LEAST_GAIN).sum() < _TOGETHER * COMPANY * LEAST_GAIN:
@@ -169,13 +169,13 @@ def find_spot(film: NDArray[Any], odd: BallFits, clean: BallFits, optics: Optics
 
 
 def _drawn_as_well(
-    film: NDArray[Any], clean: BallFits, spot: _State, kept: Bool, half: int, optics: Optics, noise: NoiseModel, others: Beside | None
+    film: NDArray[Any], clean: BallFits, spot: _State, kept: Bool, half: int, optics: Optics, noise: NoiseModel, needles: Images | None
 ) -> Bool:
     """Say which of these the spot explains better than a Gaussian does, as balls of the size of those that told it."""
     if len(clean.depth) == 0:
         return np.zeros(0, bool)
     usual = float(np.median(spot.radius[kept]))
-    window = _window(film, clean, half, others, noise)
+    window = _window(film, clean, half, needles, noise)
     drawn, plain = (_at_rest(window, clean, along, optics, noise) for along in (spot.along, np.zeros(4)))
     alike = np.abs(np.log(drawn[0].radius / usual)) < np.log(_LIKE)
     return np.asarray(alike & (drawn[1] < plain[1]))
@@ -197,18 +197,15 @@ def _start(odd: BallFits, window: _Window, along: Float) -> _State:
     return _State(along, odd.position_px - window.corner, _SHRINK * odd.radius_px, np.zeros((len(odd.depth), 7)))
 
 
-def _window(film: NDArray[Any], balls: BallFits, half: int, others: Beside | None, noise: NoiseModel) -> _Window:
+def _window(film: NDArray[Any], balls: BallFits, half: int, needles: Images | None, noise: NoiseModel) -> _Window:
     patches = cut(film, balls.position_px, half, noise)
     corner, n = patches.corner_px.astype(np.float64), len(balls.depth)
     rows, cols = np.mgrid[0 : patches.size, 0 : patches.size].astype(np.float64)
-    added, valid = np.zeros((n, *cols.shape)), patches.valid
-    if others is not None:
-        added, doubtful = beside_each(patches, range(n), others)
-        valid = valid & ~doubtful
+    added = np.zeros((n, *cols.shape)) if needles is None else np.array([needles(*patches.places(k)) for k in range(n)])
     surface = polynomial(half, cols.ravel() - half, rows.ravel() - half).T
     flat = (n, -1)
     data = (patches.values - added).reshape(flat)
-    return _Window(half, corner, data, added.reshape(flat), valid.reshape(flat).astype(float), cols.ravel(), rows.ravel(), surface)
+    return _Window(half, corner, data, added.reshape(flat), patches.valid.reshape(flat).astype(float), cols.ravel(), rows.ravel(), surface)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
