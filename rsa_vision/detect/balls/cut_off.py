@@ -60,7 +60,7 @@ def grounds_cut_off(values: Float, valid: Bool, beside: Bool, noise: NoiseModel)
     Returns
     -------
     held : ndarray of shape (n, 5)
-        Of the coefficients of all monomials but the constant one, as of :func:`rsa_vision.detect.balls.equations.polynomial`.
+        Of the coefficients of all monomials but the constant one, as of :func:`rsa_vision.detect.film.least_squares.polynomial`.
     hidden : ndarray of int, shape (n,)
         1 where it is the upper end, -1 where it is the lower one, 0 where backgrounds are seen.
     """

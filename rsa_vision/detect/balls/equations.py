@@ -9,27 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.film.least_squares import RIDGE, invert, polynomial
 from rsa_vision.types import Float, Int
-
-_RIDGE = 1e-10  # relative
-
-
-def polynomial(axis_scale: float, dx: Float, dy: Float) -> Float:
-    """Return the six monomials of a quadratic surface on a new last axis, scaled to about one at the rim of the window."""
-    u, v = dx / axis_scale, dy / axis_scale
-    return np.moveaxis(np.array([np.ones_like(u), u, v, u * u, u * v, v * v]), 0, -1)  # each in one piece in memory
-
-
-def invert(normal: Float) -> Float:
-    """Return the inverses of normal matrices (n, p, p); what they do not determine has a variance that is large, not infinite."""
-    scale = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-30))
-    both = scale[:, :, None] * scale[:, None, :]
-    return np.asarray(np.linalg.inv(normal / both + _RIDGE * np.eye(normal.shape[1])) / both)
-
-
-def chi2(of: Float, covariance: Float) -> Float:
-    """Return the squares (n,) of vectors (n, p) in units of their covariances (n, p, p)."""
-    return np.asarray(np.einsum("ni,ni->n", of, np.linalg.solve(covariance, of[:, :, None])[:, :, 0]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +81,7 @@ class Equations:
     inverse: Float
     right: Float
 
-    def normal(self, images: Float, of: Any, damping: float = _RIDGE) -> tuple[Float, Float, Float]:
+    def normal(self, images: Float, of: Any, damping: float = RIDGE) -> tuple[Float, Float, Float]:
         """Return normal matrices (n, 4, 4) and right sides (n, 4) of some windows, and what backgrounds take of the images (n, 4, 6)."""
         # added up in double precision: radius and depth of a ball that is small against the blur can all but stand for each other
         n, _, reached = images.shape

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from rsa_vision.detect.balls.cut_off import depths_cut_off, grounds_cut_off
-from rsa_vision.detect.balls.equations import invert, pixels_of, polynomial, weighted
+from rsa_vision.detect.balls.equations import pixels_of, weighted
+from rsa_vision.detect.film.least_squares import invert, polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import Patches
 from rsa_vision.detect.film.whitening import whiten_rows

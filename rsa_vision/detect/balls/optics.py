@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.decide import over_clutter
-from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.find import (
     COARSE_MU_PX,
     COARSE_SIGMA_PX,
@@ -23,6 +22,7 @@ from rsa_vision.detect.balls.find import (
     refine,
 )
 from rsa_vision.detect.balls.fits import BallFits, ball_image, slopes
+from rsa_vision.detect.film.least_squares import invert, polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.places import pairs_within

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsa_vision.detect.balls.cut_off import grounds_cut_off
-from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits
 from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
 from rsa_vision.detect.balls.surroundings import Modes
 from rsa_vision.detect.balls.usual import Proportion, Size
+from rsa_vision.detect.film.least_squares import invert, polynomial
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.profiles import Optics

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgesv
 
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.types import Bool, Float, Int
@@ -103,38 +102,3 @@ def apart_from_repairs(patches: Patches, noise: NoiseModel) -> Patches:
             seen = ~np.isin(patches.corner_px[:, k, None] + np.arange(patches.size), lines)
             valid = valid & (seen[:, None, :] if k == 0 else seen[:, :, None])
     return replace(patches, valid=valid)
-
-
-def columns(blocks: list[Float]) -> Float:
-    """Put blocks of rows of shape (k, n) beside each other as the columns of a design matrix (n, p), each in one piece in memory."""
-    return np.concatenate(blocks).T
-
-
-def weighted_least_squares(jac: Float, weight: Float, target: Float, damping: float = 1e-9) -> Float:
-    """Return one damped Gauss-Newton step: the weighted least-squares solution with columns scaled to one.
-
-    Parameters
-    ----------
-    jac : ndarray of shape (n, p)
-    weight, target : ndarray of shape (n,)
-    damping : float
-        Relative to the scaled diagonal; keeps what the pixels do not determine where it is.
-
-    Returns
-    -------
-    ndarray of shape (p,)
-    """
-    root = np.sqrt(weight)
-    weighted = jac * root[:, None]
-    return damped_solution(weighted.T @ weighted, weighted.T @ (root * target), damping)
-
-
-def damped_solution(normal: Float, right: Float, damping: float) -> Float:
-    """Solve normal equations whose columns are scaled to one, ``damping`` added to the scaled diagonal."""
-    scale = np.sqrt(np.maximum(normal.diagonal(), 1e-30))
-    scaled = normal / (scale[:, None] * scale)
-    scaled.ravel()[:: len(scale) + 1] += damping
-    *_, solution, fails = dgesv(scaled, right / scale)  # numpy's own does the same in twice the time
-    if fails:
-        raise np.linalg.LinAlgError("singular normal equations")
-    return np.asarray(solution / scale)

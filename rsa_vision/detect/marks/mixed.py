@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.find import plausible
 from rsa_vision.detect.balls.fits import BallFits, ball_image
+from rsa_vision.detect.film.least_squares import polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.needles import NeedleFit, arm_images

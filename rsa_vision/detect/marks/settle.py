@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.decide import EDGE
-from rsa_vision.detect.balls.equations import chi2, polynomial
 from rsa_vision.detect.balls.find import CHANCE
 from rsa_vision.detect.balls.fits import BallFits, uneven_white
 from rsa_vision.detect.balls.focal_spot import shapes_of
@@ -27,6 +26,7 @@ from rsa_vision.detect.balls.quanta import ENOUGH, Left, left_over, shared_more,
 from rsa_vision.detect.balls.random_effects import Common, Solution, Windows, hold, solve, variance_of
 from rsa_vision.detect.balls.surroundings import Modes, Places, around_each, mean_beside, modes, texture
 from rsa_vision.detect.balls.usual import Proportion, proportion, size_unlike, usual_size
+from rsa_vision.detect.film.least_squares import chi2, polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.shoulder import Curve, curve_of, shown, unseen_slope

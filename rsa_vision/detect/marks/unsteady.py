@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
-from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.fits import BallFits, half_size
 from rsa_vision.detect.balls.focal_spot import shapes_of
 from rsa_vision.detect.balls.surroundings import Places
+from rsa_vision.detect.film.least_squares import invert, polynomial
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from rsa_vision.detect.film.patches import weighted_least_squares
+from rsa_vision.detect.film.least_squares import weighted_least_squares
 from rsa_vision.types import Float
 
 _KNOTS = 1.5  # blur widths between the knots of a profile across an edge

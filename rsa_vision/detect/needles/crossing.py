@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.equations import polynomial
+from rsa_vision.detect.film.least_squares import damped_solution, polynomial, weighted_least_squares
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution, weighted_least_squares
+from rsa_vision.detect.film.patches import apart_from_repairs, cut
 from rsa_vision.detect.film.progress import WEIGHED, in_vain
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.edge import edge_profile

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.usual import proportion_of_all
+from rsa_vision.detect.film.least_squares import weighted_least_squares
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import weighted_least_squares
 from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import Window, fit_crossing, window_of

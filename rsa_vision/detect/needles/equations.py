@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from rsa_vision.detect.film.least_squares import damped_solution
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import damped_solution
 from rsa_vision.detect.film.whitening import Filter
 from rsa_vision.detect.models.needles import NeedleFit, arm_images, arms_by_optics
 from rsa_vision.detect.models.profiles import Optics

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.find import CHANCE
+from rsa_vision.detect.film.least_squares import damped_solution, polynomial
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import apart_from_repairs, cut, damped_solution
+from rsa_vision.detect.film.patches import apart_from_repairs, cut
 from rsa_vision.detect.film.progress import WEIGHED, in_vain
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.equations import polynomial
+from rsa_vision.detect.film.least_squares import polynomial
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, needle_image
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import unfit

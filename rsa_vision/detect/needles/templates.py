@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.equations import polynomial
+from rsa_vision.detect.film.least_squares import polynomial
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, arm_images, needle_image, support
 from rsa_vision.detect.models.profiles import Optics

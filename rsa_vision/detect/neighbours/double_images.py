@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.alike import true_spread
 from rsa_vision.detect.balls.fits import BallFits
+from rsa_vision.detect.film.least_squares import columns
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import columns
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.blobs import STRETCH, long_axis

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from rsa_vision.detect.balls.alike import SD_OF_MAD
-from rsa_vision.detect.balls.equations import invert
+from rsa_vision.detect.film.least_squares import invert
 from rsa_vision.types import Bool, Float
 
 _FAR: Final = 5.0  # standard deviations that noise does not reach

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.equations import polynomial
 from rsa_vision.detect.balls.fits import half_size
 from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
+from rsa_vision.detect.film.least_squares import columns, polynomial, weighted_least_squares
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import columns, cut, weighted_least_squares
+from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.film_curve import film_curve, slope_of_film_curve
 from rsa_vision.detect.models.lapping import LEAST, lapping, product_image, product_with

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.equations import invert
 from rsa_vision.detect.balls.fits import BallFits, radii, uneven, uneven_white
 from rsa_vision.detect.balls.focal_spot import Spot
+from rsa_vision.detect.film.least_squares import columns, damped_solution, invert, weighted_least_squares
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
-from rsa_vision.detect.film.patches import columns, damped_solution, weighted_least_squares
 from rsa_vision.detect.film.progress import WEIGHED, in_vain
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.shown import Images

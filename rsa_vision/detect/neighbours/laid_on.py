@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.decide import LEAST_KNOWN, like_clear, look_clear
 from rsa_vision.detect.balls.find import distinct, no_fits
 from rsa_vision.detect.balls.fits import BallFits, join
+from rsa_vision.detect.film.least_squares import weighted_least_squares
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import weighted_least_squares
 from rsa_vision.detect.film.places import are_within
 from rsa_vision.detect.models.lapping import fine_places
 from rsa_vision.detect.models.painted import Painted

@@ -14,8 +14,9 @@ from rsa_vision.detect.balls.decide import LEAST_KNOWN, height_of, look_clear
 from rsa_vision.detect.balls.find import BATCH, no_fits
 from rsa_vision.detect.balls.fits import BallFits, half_size, join
 from rsa_vision.detect.balls.focal_spot import shapes_of
+from rsa_vision.detect.film.least_squares import damped_solution
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import cut, damped_solution
+from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.profiles import Optics

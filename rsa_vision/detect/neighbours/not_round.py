@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.cut_off import grounds_cut_off
-from rsa_vision.detect.balls.equations import chi2, invert, polynomial
 from rsa_vision.detect.balls.fits import BallFits, half_size, slopes
 from rsa_vision.detect.balls.usual import over_kinds
+from rsa_vision.detect.film.least_squares import chi2, invert, polynomial
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.whitening import whiten_rows

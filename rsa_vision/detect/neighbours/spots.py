@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.decide import LEAST_KNOWN, look_clear, over_clutter
-from rsa_vision.detect.balls.equations import invert, polynomial
 from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, SURE, misfit, plausible
 from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits, half_size, join, slopes, uneven, uneven_white
 from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
+from rsa_vision.detect.film.least_squares import invert, polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.models.profiles import Optics, ball_table

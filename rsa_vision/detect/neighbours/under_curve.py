@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.fits import BallFits, radii
+from rsa_vision.detect.film.least_squares import weighted_least_squares
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.patches import weighted_least_squares
 from rsa_vision.detect.models.film_curve import by_film_curve, film_curve
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
