@@ -1,10 +1,11 @@
-"""Places on a film, (col, row): how far apart they are, and which lie on it."""
+"""Places on a film, (col, row): how far apart they are, which lie on it, and what it shows there."""
 
 from __future__ import annotations
 
 from itertools import chain
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -37,3 +38,12 @@ def are_within(places: Float, others: Float, reach_px: Float | float, own_px: Fl
 def on_film(film: NDArray[Any], cols: Float, rows: Float) -> Bool:
     """Say which places lie on the film."""
     return np.asarray((cols > -0.5) & (cols < film.shape[1] - 0.5) & (rows > -0.5) & (rows < film.shape[0] - 0.5))
+
+
+def sample(film: NDArray[Any], cols: Float, rows: Float) -> Float:
+    """Return values between pixels, (n,), of a film that goes on beyond its border as it ends there."""
+    corner = np.floor([cols.min(), rows.min()]).astype(int).clip(0, np.array(film.shape[::-1]) - 1)
+    end = np.ceil([cols.max(), rows.max()]).astype(int).clip(corner, np.array(film.shape[::-1]) - 1) + 1
+    patch = film[corner[1] : end[1], corner[0] : end[0]].astype(np.float32)
+    at = (cols - corner[0]).astype(np.float32), (rows - corner[1]).astype(np.float32)
+    return np.asarray(cv2.remap(patch, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float64).ravel()

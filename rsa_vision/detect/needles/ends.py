@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.film.places import on_film
+from rsa_vision.detect.film.places import on_film, sample
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
-from rsa_vision.detect.neighbours.rims import sample
 
 _BEYOND = 3.0  # blur widths past the end, and aside of the arm, where nothing of it is left
 _ON_THE_ARM = 0.75  # of its length: as high as anywhere, and none of its end

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.fits import BallFits
-from rsa_vision.detect.film.places import on_film
+from rsa_vision.detect.film.places import on_film, sample
 from rsa_vision.detect.models.shown import Beside
-from rsa_vision.types import Bool, Float, Int
+from rsa_vision.types import Bool, Int
 
 BEYOND: Final = 2.0  # blur widths outside the rim, where hardly anything of a ball is left
 AS_HIGH: Final = 0.8  # of the height: a ball over the strongest thing that it still outdoes has half
@@ -75,12 +74,3 @@ def cut_from_outlines(touching: Bool, ends: Bool) -> Bool:
     ndarray of bool, shape (n,)
     """
     return np.full(len(ends), len(ends) > 0 and bool(touching.all()) and bool(ends.mean() > _OF_OUTLINES))
-
-
-def sample(film: NDArray[Any], cols: Float, rows: Float) -> Float:
-    """Values between pixels, of a film that goes on beyond its border as it ends there."""
-    corner = np.floor([cols.min(), rows.min()]).astype(int).clip(0, np.array(film.shape[::-1]) - 1)
-    end = np.ceil([cols.max(), rows.max()]).astype(int).clip(corner, np.array(film.shape[::-1]) - 1) + 1
-    patch = film[corner[1] : end[1], corner[0] : end[0]].astype(np.float32)
-    at = (cols - corner[0]).astype(np.float32), (rows - corner[1]).astype(np.float32)
-    return np.asarray(cv2.remap(patch, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float64).ravel()
