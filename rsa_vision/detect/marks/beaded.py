@@ -14,7 +14,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import Box, box_of
 from rsa_vision.detect.film.places import are_within
 from rsa_vision.detect.marks.mixed import part
-from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.needles import NeedleFit, either_way, middle, unexplained
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.arms import meet_others
@@ -23,7 +23,6 @@ from rsa_vision.detect.needles.crossing import fit_crossing
 from rsa_vision.detect.needles.fits import PROMISING, explains
 from rsa_vision.detect.needles.of_a_kind import is_of_kind, starts_like, typical_of
 from rsa_vision.detect.needles.pins import fit_beside_balls
-from rsa_vision.detect.needles.pointed import either_way, middle, unexplained
 from rsa_vision.detect.needles.sets import NEAREST_PX
 from rsa_vision.detect.neighbours.beside import all_but, deep_at, take_balls
 from rsa_vision.detect.neighbours.laid_on import over_arms

@@ -107,6 +107,28 @@ class NeedleFit:
         return replace(optics, sigma_px=optics.sigma_px * math.exp(_BLUR_GRID * round(self.blurrier / _BLUR_GRID)))
 
 
+def unexplained(fit: NeedleFit) -> float:
+    """Return what the model leaves."""
+    return fit.misfit + 1 - fit.explained
+
+
+def middle(fit: NeedleFit) -> Float:
+    """Return the middle of a pin, (col, row)."""
+    half, angle = 0.5 * fit.shape.length_px, float(fit.angles[0])
+    return np.asarray(fit.position_px + half * np.array([math.cos(angle), -math.sin(angle)]))
+
+
+def turned(fit: NeedleFit) -> tuple[Float, Float]:
+    """Tip and direction of the same pin the other way round."""
+    return fit.position_px + fit.shape.length_px * fit.way, fit.angles + np.pi
+
+
+def either_way(fit: NeedleFit) -> list[NeedleFit]:
+    """Return a pin, and the same the other way round."""
+    tip, angles = turned(fit)
+    return [fit, replace(fit, position_px=tip, angles=angles)]
+
+
 def wrapped(angles: Float) -> Float:
     """Return angles, or what they differ by, as turns of half a circle at the most either way, radians."""
     return np.asarray(np.angle(np.exp(1j * angles)))

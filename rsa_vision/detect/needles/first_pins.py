@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, turned, unexplained
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import explains, fit_needles, unfit
 from rsa_vision.detect.needles.laid_over import LIKENESS, laid_over
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS
-from rsa_vision.detect.needles.pointed import STANDS_OUT_ROUGHLY, same_body, turned, unexplained
-from rsa_vision.detect.needles.sets import NEAREST_PX, TAPERS, on_arms
+from rsa_vision.detect.needles.pointed import STANDS_OUT_ROUGHLY
+from rsa_vision.detect.needles.sets import NEAREST_PX, TAPERS, on_arms, same_body
 from rsa_vision.types import Float
 
 MOST_STROKES = 120  # strongest of a film, most of them seen by two filters

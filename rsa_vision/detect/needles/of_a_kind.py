@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.patches import Box
-from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.needles import NeedleFit, turned, unexplained
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import fit_crossing
 from rsa_vision.detect.needles.fits import explains, fit_needles
@@ -26,13 +26,10 @@ from rsa_vision.detect.needles.pointed import (
     SIGNIFICANT,
     STANDS_OUT_ROUGHLY,
     is_pin,
-    same_body,
     surer_than_rod,
-    turned,
-    unexplained,
     worse_by,
 )
-from rsa_vision.detect.needles.sets import on_arms
+from rsa_vision.detect.needles.sets import on_arms, same_body
 from rsa_vision.types import Float, Int
 
 _MOST_IN_VAIN = 50  # places in a row at which there are none

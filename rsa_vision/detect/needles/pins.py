@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.optics import CAP
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, middle, turned, unexplained
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
@@ -26,12 +26,9 @@ from rsa_vision.detect.needles.pointed import (
     STANDS_OUT_ROUGHLY,
     SURER_THAN_ROD,
     is_pin,
-    middle,
     pointed,
     points_one_way,
     shows_its_form,
-    turned,
-    unexplained,
 )
 from rsa_vision.detect.needles.sets import MOST_TOGETHER, TAPERS, fit_all, is_located, on_arms, others_beside
 from rsa_vision.detect.needles.shared import fit_shared

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +10,11 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import MISFIT
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.needles import NeedleFit
+from rsa_vision.detect.models.needles import NeedleFit, either_way, turned, unexplained
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import Unseen, chi2_of, fit_crossing, window_of
 from rsa_vision.detect.needles.fits import STANDS_OUT, explains, fit_needles, significant_misfit
-from rsa_vision.types import Float
 
 SLIM = 4.5  # length over half the width; two balls side by side have four
 EXPLAINED = 0.95  # of a pin's image; long shadows and the strokes of letters leave more
@@ -118,17 +116,6 @@ def points_one_way(
     return bool(more - left > 2 * _ONE_WAY * max(left, 1.0) / fit.n_core + _OF_LEFT * max(left - 1.0, 0.0))
 
 
-def turned(fit: NeedleFit) -> tuple[Float, Float]:
-    """Tip and direction of the same pin the other way round."""
-    return fit.position_px + fit.shape.length_px * fit.way, fit.angles + np.pi
-
-
-def either_way(fit: NeedleFit) -> list[NeedleFit]:
-    """Return a pin, and the same the other way round."""
-    tip, angles = turned(fit)
-    return [fit, replace(fit, position_px=tip, angles=angles)]
-
-
 def surer_than_rod(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:
     """Return half the chi2 by which a rod of free length, width and direction in the pin's place is worse."""
     thinner = replace(fit.shape, taper=_ROD, half_width_px=0.7 * fit.shape.half_width_px, length_px=0.8 * fit.shape.length_px)
@@ -141,19 +128,3 @@ def worse_by(film: NDArray[Any], fit: NeedleFit, other: NeedleFit, optics: Optic
     window = window_of(film, [fit], optics, noise, None)
     of_fit, of_other = (chi2_of(window, f, optics, noise) for f in (fit, other))
     return 0.5 * (of_other - of_fit) / max(of_fit / len(window.data), 1.0)
-
-
-def unexplained(fit: NeedleFit) -> float:
-    """Return what the model leaves."""
-    return fit.misfit + 1 - fit.explained
-
-
-def same_body(a: NeedleFit, b: NeedleFit) -> bool:
-    """Say whether two fits lie on the same stroke, perhaps the other way round."""
-    return math.dist(middle(a), middle(b)) < 0.25 * a.shape.length_px
-
-
-def middle(fit: NeedleFit) -> Float:
-    """Return the middle of a pin, (col, row)."""
-    half, angle = 0.5 * fit.shape.length_px, float(fit.angles[0])
-    return np.asarray(fit.position_px + half * np.array([math.cos(angle), -math.sin(angle)]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.places import gaps
-from rsa_vision.detect.models.needles import NeedleFit, needle_image, wrapped
+from rsa_vision.detect.models.needles import NeedleFit, middle, needle_image, wrapped
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import fit_crossing
@@ -117,3 +118,8 @@ def _on_arm(places: Float, needle: NeedleFit) -> Bool:
     along, across = (dx * c + dy * s) / needle.shape.length_px, np.abs(dy * c - dx * s) / needle.shape.half_width_px
     on: Bool = ((along > -0.3) & (along < 1.2) & (across < 2)).any(axis=1)
     return on
+
+
+def same_body(a: NeedleFit, b: NeedleFit) -> bool:
+    """Say whether two fits lie on the same stroke, perhaps the other way round."""
+    return math.dist(middle(a), middle(b)) < 0.25 * a.shape.length_px

@@ -15,7 +15,7 @@ from rsa_vision.detect.balls.find import COARSE_SIGMA_PX, EXPLAINED, MISFIT
 from rsa_vision.detect.balls.optics import CAP
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.places import are_within
-from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, unexplained
 from rsa_vision.detect.models.painted import paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
@@ -25,7 +25,6 @@ from rsa_vision.detect.needles.edges import proportion_of, tees_beside_edges
 from rsa_vision.detect.needles.ends import arms_go_on
 from rsa_vision.detect.needles.fits import excess_of, explains, fit_needles
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
-from rsa_vision.detect.needles.pointed import unexplained
 from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, others_beside
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.detect.needles.templates import SCALE, find_like, template_of, worth_a_fit
