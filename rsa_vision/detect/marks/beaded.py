@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from rsa_vision.detect.needles.crossing import fit_crossing
 from rsa_vision.detect.needles.fits import PROMISING, explains
 from rsa_vision.detect.needles.of_a_kind import is_of_kind, starts_like, typical_of
 from rsa_vision.detect.needles.pins import fit_beside_balls
-from rsa_vision.detect.needles.sets import NEAREST_PX
+from rsa_vision.detect.needles.sets import is_apart
 from rsa_vision.detect.neighbours.beside import all_but, deep_at, take_balls
 from rsa_vision.detect.neighbours.laid_on import over_arms
 from rsa_vision.types import Bool, Float
@@ -68,7 +67,7 @@ def find_beaded(
     balls = join([left, on_them])
     beside = BallsBeside(all_but(balls, np.arange(0), optics, None), balls, optics)
     fitted, pin_optics = fit_beside_balls(film, [*pins, *more], beside, optics, pin_optics, noise)
-    return (fitted, pin_optics) if all(_is_there(f, fitted) for f in pins) else None
+    return (fitted, pin_optics) if not any(is_apart(f, fitted) for f in pins) else None
 
 
 def _hidden(
@@ -121,10 +120,6 @@ def _look(box: Box, ball: Float, typical: NeedleFit) -> tuple[Box, Float]:
     places = ball + grid[np.hypot(*grid.T) < typical.shape.length_px]
     deep = deep_at(box.values, places - box.corner_px, typical.shape.half_width_px, None)
     return box, places[deep > _LOW * abs(typical.height)]
-
-
-def _is_there(needle: NeedleFit, fitted: list[NeedleFit]) -> bool:
-    return any(math.dist(needle.position_px, f.position_px) < NEAREST_PX for f in fitted)
 
 
 def _one_of(

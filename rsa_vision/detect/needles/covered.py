@@ -22,7 +22,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.needles.crossing import Window, fit_crossing, window_of
 from rsa_vision.detect.needles.fits import PROMISING, explains
-from rsa_vision.detect.needles.sets import NEAREST_PX, on_arms, others_beside
+from rsa_vision.detect.needles.sets import is_apart, on_arms, others_beside
 from rsa_vision.detect.needles.templates import SCALE
 from rsa_vision.detect.neighbours.foreign import beyond_noise, robust_residual
 from rsa_vision.types import Bool, Float, Int
@@ -76,13 +76,13 @@ def find_covered(
         before = len(tees)
         for start in _two_arms(film, strokes[:, :2], tees, model, optics):
             bare = film.astype(np.float32) if bare is film else bare
-            if abs(start.depth) < faintest * abs(model.depth) or not _apart(start, tees):
+            if abs(start.depth) < faintest * abs(model.depth) or not is_apart(start, tees):
                 continue
             others = others_beside(start, tees, optics)
             tried = [_robust(film, bare, replace(start, shape=end.shape), others, optics, noise) for end in ends]
             fit, hidden = min(tried, key=lambda one: len(one[1][0]))
             uncovered, bare[hidden] = bare[hidden], np.nan
-            if _is_one(fit, _seen(bare, fit, optics)) and _is_like(fit, known) and _apart(fit, tees):
+            if _is_one(fit, _seen(bare, fit, optics)) and _is_like(fit, known) and is_apart(fit, tees):
                 tees.append(fit)
             else:
                 bare[hidden] = uncovered
@@ -121,7 +121,7 @@ def uncovered(
         tried = [_robust(film, bare, start, others, optics, noise) for start in starts]
         fit, hidden = min(tried, key=lambda one: len(one[1][0]))
         before, bare[hidden] = bare[hidden], np.nan
-        if _is_one(fit, _seen(bare, fit, optics)) and _is_like(fit, known) and math.dist(fit.position_px, tee.position_px) < NEAREST_PX:
+        if _is_one(fit, _seen(bare, fit, optics)) and _is_like(fit, known) and not is_apart(fit, [tee]):
             tees.append(fit)
         else:
             bare[hidden] = before
@@ -133,10 +133,6 @@ def _sizes(known: list[NeedleFit]) -> list[NeedleFit]:
     """Return a tee of middle size, and two that stand for two sizes: fiducial marks and control points may be of two."""
     by_size = sorted(known, key=lambda t: t.shape.length_px)
     return [by_size[part * (len(known) - 1) // 4] for part in (2, 1, 3)]
-
-
-def _apart(fit: NeedleFit, tees: list[NeedleFit]) -> bool:
-    return all(math.dist(t.position_px, fit.position_px) > NEAREST_PX for t in tees)
 
 
 def _two_arms(film: NDArray[Any], strokes_px: Float, known: list[NeedleFit], model: NeedleFit, optics: Optics) -> list[NeedleFit]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,7 +16,7 @@ from rsa_vision.detect.needles.fits import explains, fit_needles, unfit
 from rsa_vision.detect.needles.laid_over import LIKENESS, laid_over
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS
 from rsa_vision.detect.needles.pointed import STANDS_OUT_ROUGHLY
-from rsa_vision.detect.needles.sets import NEAREST_PX, TAPERS, on_arms, same_body
+from rsa_vision.detect.needles.sets import TAPERS, is_apart, on_arms, same_body
 from rsa_vision.types import Float
 
 MOST_STROKES = 120  # strongest of a film, most of them seen by two filters
@@ -118,7 +117,7 @@ def distinct_pins(pins: list[NeedleFit]) -> list[NeedleFit]:
     """Return one fit of every pin, best first."""
     kept: list[NeedleFit] = []
     for fit in sorted(pins, key=unexplained):
-        if all(math.dist(fit.position_px, k.position_px) > NEAREST_PX and not same_body(fit, k) for k in kept):
+        if is_apart(fit, kept) and not any(same_body(fit, k) for k in kept):
             kept.append(fit)
     return kept
 

@@ -120,6 +120,11 @@ def _on_arm(places: Float, needle: NeedleFit) -> Bool:
     return on
 
 
+def is_apart(needle: NeedleFit, others: list[NeedleFit], gap_px: float = NEAREST_PX) -> bool:
+    """Say whether the tip of a needle is that of none of others."""
+    return all(math.dist(needle.position_px, other.position_px) > gap_px for other in others)
+
+
 def same_body(a: NeedleFit, b: NeedleFit) -> bool:
     """Say whether two fits lie on the same stroke, perhaps the other way round."""
     return math.dist(middle(a), middle(b)) < 0.25 * a.shape.length_px

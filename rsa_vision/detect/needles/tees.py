@@ -25,7 +25,7 @@ from rsa_vision.detect.needles.edges import proportion_of, tees_beside_edges
 from rsa_vision.detect.needles.ends import arms_go_on
 from rsa_vision.detect.needles.fits import excess_of, explains, fit_needles
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
-from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, others_beside
+from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, is_apart, others_beside
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.detect.needles.templates import SCALE, find_like, template_of, worth_a_fit
 from rsa_vision.detect.needles.twins import split_twins
@@ -136,8 +136,8 @@ def _found_from(
     if len(clean) >= _LEAST_PARALLEL:
         bare, more = find_covered(film, bare, clean, strokes, optics, noise, _FAINTEST)
         if more:
-            rough = _apart([t for t in fitted if all(t is not c for c in clean)], more, NEAREST_PX)
-            others = _apart(others, more, _SAME_JUNCTION * clean[0].shape.length_px)
+            rough = [t for t in fitted if all(t is not c for c in clean) and is_apart(t, more)]
+            others = [t for t in others if is_apart(t, more, _SAME_JUNCTION * clean[0].shape.length_px)]
             fitted, optics = fit_shared(bare, [*clean, *rough, *more], optics, noise, parallel=True)
     slack = _BEFORE if len(clean) >= _LEAST_PARALLEL else 1.0  # of what is parallel to others, and as large, bone may leave more
     others += [replace(t, slants=None) for t in fitted if not is_tee(t, slack)]
@@ -164,11 +164,6 @@ def _undisturbed(
         return film, fitted, optics
     fitted, optics = fit_shared(bare, [*plain, *bared, *as_before], optics, noise, parallel=True)
     return bare, fitted[: len(plain) + len(bared)] + as_before, optics
-
-
-def _apart(rough: list[NeedleFit], known: list[NeedleFit], gap_px: float) -> list[NeedleFit]:
-    """Leave out rough fits to what is known by now."""
-    return [t for t in rough if all(math.dist(t.position_px, k.position_px) > gap_px for k in known)]
 
 
 def first_tees(film: NDArray[Any], junctions: Float, noise: NoiseModel) -> list[NeedleFit]:
@@ -249,7 +244,7 @@ def _models(junctions: Float, fitted_at: AtJunction) -> tuple[list[NeedleFit], l
     turned: list[NeedleFit] = []
     for i, fit in enumerate(rough):  # the closest first: one turned by a right angle may explain much of another
         closer = [clean[0], *rough[:i]]
-        if is_tee(fit, slack=_BEFORE) and _turned(fit, clean[0]) and _apart([fit], closer, _SAME_JUNCTION * fit.shape.length_px):
+        if is_tee(fit, slack=_BEFORE) and _turned(fit, clean[0]) and is_apart(fit, closer, _SAME_JUNCTION * fit.shape.length_px):
             turned.append(fit)
     return [clean[0], *(f for f in ends if f is not clean[0] and all(f is not t for t in turned))], turned
 
@@ -319,9 +314,9 @@ def _outshone(film: NDArray[Any], tees: list[NeedleFit], model: NeedleFit, optic
         left, top = (max(int(x) - half, 0) // SCALE * SCALE for x in tee.position_px)
         box = film[top : top + 2 * half, left : left + 2 * half]
         for col, row, likeness in find_like(painted.taken_from(box, left, top), seen):
-            place = np.array([col + left, row + top])
-            if min(math.dist(t.position_px, place) for t in tees) > NEAREST_PX:
-                starts.append((likeness, replace(model, position_px=place)))
+            start = replace(model, position_px=np.array([col + left, row + top]))
+            if is_apart(start, tees):
+                starts.append((likeness, start))
     best = [start for _, start in sorted(starts, key=lambda item: -item[0])]
     found = _peeled(film, best, optics, noise, tees)[len(tees) :]
     # where arms only touch, a first look is as good as a last one
@@ -344,7 +339,7 @@ def _peeled(
         fit = fit_crossing(film, [start], optics, noise, others=others, quick=True)[0]
         deep = np.sign(fit.depth) == np.sign(start.depth) and abs(fit.depth) > _FAINTEST * abs(start.depth)
         near = math.dist(fit.position_px, start.position_px) < 2 * NEAREST_PX
-        if deep and near and is_tee(fit, slack=ROUGH) and all(math.dist(k.position_px, fit.position_px) > NEAREST_PX for k in kept):
+        if deep and near and is_tee(fit, slack=ROUGH) and is_apart(fit, kept):
             kept.append(fit)
             in_vain = 0
     return kept
@@ -354,6 +349,6 @@ def _distinct(tees: list[NeedleFit], model: NeedleFit) -> list[NeedleFit]:
     kept: list[NeedleFit] = []
     for fit in sorted(tees, key=unexplained):
         deep = np.sign(fit.depth) == np.sign(model.depth) and abs(fit.depth) > _FAINTEST * abs(model.depth)
-        if deep and is_tee(fit, slack=ROUGH) and all(math.dist(fit.position_px, k.position_px) > NEAREST_PX for k in kept):
+        if deep and is_tee(fit, slack=ROUGH) and is_apart(fit, kept):
             kept.append(fit)
     return kept
