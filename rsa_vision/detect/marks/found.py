@@ -29,7 +29,7 @@ from rsa_vision.detect.marks.unsteady import Marks, by_lines, unsteady_lines
 from rsa_vision.detect.models.needles import NeedleFit, needle_image
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.models.shown import Images, nothing
 from rsa_vision.detect.needles.balls_beside import lapped
 from rsa_vision.detect.needles.first_pins import look_for_pins
 from rsa_vision.detect.needles.fits import significant_misfit
@@ -233,7 +233,7 @@ def _on_needles(film: NDArray[Any], faint: Candidates, found: Balls, painted: Pa
 
 def _taken_apart(film: NDArray[Any], found: Balls, needles: _Needles, optics: Optics, noise: NoiseModel) -> tuple[Balls, list[NeedleFit]]:
     """Balls, and the tees with those that only a ball on them explains."""
-    tees, painted, tee_optics = list[NeedleFit](), needles.painted or _nothing, needles.tee_optics
+    tees, painted, tee_optics = list[NeedleFit](), needles.painted or nothing, needles.tee_optics
     poor = of_odd_size(np.array([tee.shape.half_width_px for tee in needles.tees]), np.zeros(len(needles.tees)), NEEDLES_ALIKE)
     poor |= np.array([significant_misfit(tee, noise) > DOUBTFUL * MISFIT for tee in needles.tees], bool)
     clean = [tee for tee, odd in zip(needles.tees, poor, strict=True) if not odd]
@@ -349,10 +349,6 @@ def _undisturbed(found: Balls, optics: Optics) -> list[Int]:
     plain = ~(found.crossed | found.drawn)
     groups = [np.array(g) for g in groups_of(found.fits, optics)]
     return [g for g in groups if 1 < len(g) <= MOST_IN_GROUP and plain[g].all()]
-
-
-def _nothing(cols: Float, _: Float) -> Float:
-    return np.zeros(cols.shape)
 
 
 def _are_rather_balls(film: NDArray[Any], tees: list[NeedleFit], seeds: BallFits, optics: Optics, noise: NoiseModel) -> list[bool]:

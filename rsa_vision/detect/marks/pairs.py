@@ -14,12 +14,12 @@ from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.optics import KAPPA, SIGMAS_PX, ball_evidence, unexpected
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.models.shown import for_all, nothing
 from rsa_vision.detect.neighbours.blobs import CLEAR, LEAST_GAIN, NEARLY, OF_A_BLOB, STRETCH, long_axis
 from rsa_vision.detect.neighbours.group_images import GroupWindow, images_in, window_around
 from rsa_vision.detect.neighbours.groups import STEPS, fit_group
 from rsa_vision.detect.neighbours.not_round import are_not_round
 from rsa_vision.detect.search.candidates import Candidates
-from rsa_vision.types import Bool, Float
 
 _MOST = 100  # seeds among which single balls are looked for
 _STRONGEST = 24  # candidates that are asked where there is no seed
@@ -63,7 +63,7 @@ def optics_of_pairs(
     for some in (sure.rows(slice(_FEW)), sure):  # mostly a few are enough
         single = fit_at(film, some.position_px, some.radius_px, optics, noise, quick=True)
         close = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
-        alone = close & ~are_not_round(film, single, _nothing, optics, noise)
+        alone = close & ~are_not_round(film, single, for_all(nothing), optics, noise)
         if np.count_nonzero(alone) >= len(alone) / 3:
             return None
     rest = ~alone & np.isfinite(single.position_px).all(axis=1)
@@ -128,7 +128,3 @@ def _are_two(pair: BallFits, single: BallFits, noise: NoiseModel, slack: float =
     least = LEAST_GAIN * noise.correlation.sum() / (np.pi * single.radius_px[0] ** 2)
     alike = abs(float(np.log(pair.radius_px[0] / pair.radius_px[1]))) < _ALIKE and pair.depth[0] * pair.depth[1] > 0
     return bool(alike and plausible(pair, noise, slack).all() and single.chi2_core[0] - pair.chi2_core.mean() > least)
-
-
-def _nothing(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
-    return np.zeros(cols.shape), np.zeros(cols.shape, bool)

@@ -17,7 +17,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.places import are_within, gaps, on_film
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.models.shown import Images, for_all
 from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, all_but, deep_at, groups_of, heaps_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.blobs import split_blobs
 from rsa_vision.detect.neighbours.crowds import resolve_crowds
@@ -116,7 +116,7 @@ def resolve_balls(
         none = np.zeros(0, bool)
         return Balls(seeds, none, none, none, none, np.zeros((0, 2, 2)), None)
     beside: Images | None = needles
-    others = None if needles is None else lambda _i, cols, rows: (needles(cols, rows), np.zeros(cols.shape, bool))
+    others = None if needles is None else for_all(needles)
     single = distinct(fit_at(film, seeds.position_px, seeds.radius_px, optics, noise, others, quick=True), noise)
     clean = plausible(single, noise) & (misfit(single, noise) < DOUBTFUL * MISFIT)
     drawn = find_spot(film, single.rows(~clean), single.rows(clean), optics, noise, needles)

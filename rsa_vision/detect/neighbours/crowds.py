@@ -14,7 +14,7 @@ from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.places import are_within, gaps
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.models.shown import Images
+from rsa_vision.detect.models.shown import Images, for_all
 from rsa_vision.detect.neighbours.beside import all_but, deep_at, lapping_balls
 from rsa_vision.detect.neighbours.blobs import LEAST_APART, STRETCH, long_axis
 from rsa_vision.detect.neighbours.group_images import images_in, window_around
@@ -69,17 +69,13 @@ def resolve_crowds(
     if len(known.depth) < LEAST_KNOWN:
         return found
     radius, depth = float(np.median(known.radius_px)), float(np.median(known.depth))
-    others = all_but(found, np.arange(0), optics, needles)
-
-    def others_of(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
-        return others(cols, rows), np.zeros(cols.shape, bool)
-
+    others = for_all(all_but(found, np.arange(0), optics, needles))
     place = candidates.position_px
     place = place[~are_within(place, found.position_px, found.radius_px + 0.6 * radius)]
     place = place[deep_at(film, place, radius, needles) > _DEEP * abs(depth)]
     if len(place) == 0:
         return found
-    single = fit_at(film, place, np.full(len(place), _START * radius), optics, noise, others_of, quick=True)
+    single = fit_at(film, place, np.full(len(place), _START * radius), optics, noise, others, quick=True)
     size = single.radius_px / radius
     worth = (size > _SIZES[0]) & (size < _SIZES[1]) & (single.explained > _EXPLAINED) & (np.sign(single.depth) == np.sign(depth))
     worth &= np.abs(single.depth) > _DEEP * abs(depth)

@@ -20,8 +20,8 @@ from rsa_vision.detect.film.patches import cut
 from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.edge import edge_profile
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.models.shown import Images
-from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, all_but, groups_of, images_beside
+from rsa_vision.detect.models.shown import Images, for_all
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, all_but, groups_of
 from rsa_vision.detect.neighbours.group_images import square
 from rsa_vision.detect.neighbours.groups import fit_group
 from rsa_vision.detect.neighbours.rims import goes_on
@@ -90,17 +90,12 @@ def on_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Optics, n
     out, height, clear = np.zeros(len(fits.depth), bool), height_of(fits, optics.sigma_px), look_clear(fits, noise)
     known = np.count_nonzero(clear) >= LEAST_KNOWN
     full = height > _FAINT * np.median(height[clear]) if known else clear
-    strong = fits.rows(full)
-
-    def beside(_: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
-        return images_beside(strong, np.arange(0), optics, needles, cols, rows)
-
-    others = all_but(strong, np.arange(0), optics, needles)
+    others = all_but(fits.rows(full), np.arange(0), optics, needles)
     for i in np.flatnonzero(~full):
         of_ball, of_line, of_both = _gains(film, fits.position_px[[i]], float(fits.radius_px[i]), optics, noise, others)[0]
         if of_line > of_ball:
             own = np.sqrt(max(of_both - of_line, 0.0))
-            end = own < _OF_ENDS * limit and goes_on(film, fits.rows([i]), np.array([i]), beside, optics.sigma_px)[0]
+            end = own < _OF_ENDS * limit and goes_on(film, fits.rows([i]), np.array([i]), for_all(others), optics.sigma_px)[0]
             out[i] = end or own < _FAR * limit
     return out
 
