@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.cut_off import grounds_cut_off
+from rsa_vision.detect.balls.find import BATCH
 from rsa_vision.detect.balls.fits import BallFits, half_size, slopes
 from rsa_vision.detect.balls.usual import over_kinds
 from rsa_vision.detect.film.least_squares import chi2, invert, polynomial
@@ -104,10 +105,10 @@ def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optic
     halves = np.array([half_size(r, optics.sigma_px) for r in balls.radius_px])
     table = ball_table(optics.sigma_px, optics.mu_px)
     out, covariance = np.zeros((len(halves), 4)), np.zeros((len(halves), 4, 4))
-    for half in np.unique(halves):
-        index = np.flatnonzero(halves == half)
-        fits, side = balls.rows(index), 2 * int(half) + 1
-        patches = cut(film, fits.position_px, int(half), noise)
+    of_one_size = [np.flatnonzero(halves == half) for half in np.unique(halves)]
+    for index in (same[k : k + BATCH] for same in of_one_size for k in range(0, len(same), BATCH)):
+        fits, half = balls.rows(index), int(halves[index[0]])
+        patches, side = cut(film, fits.position_px, half, noise), 2 * half + 1
         rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1).astype(np.float64)
         near, doubtful = beside_each(patches, index, beside)
         data, valid = (patches.values - near).reshape(len(index), -1), (patches.valid & ~doubtful).reshape(len(index), -1)
@@ -122,7 +123,7 @@ def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optic
         cos, sin = (dx**2 - dy**2) / square, 2 * dx * dy / square  # of twice the angle
         twofold = 0.25 * bend[:, None] * np.stack([cos, sin], axis=1)
         fourfold = falls[:, None] * np.stack([cos**2 - sin**2, 2 * cos * sin], axis=1)
-        surface = np.broadcast_to(polynomial(int(half), cols - half, rows - half).T, (len(index), 6, side**2))
+        surface = np.broadcast_to(polynomial(half, cols - half, rows - half).T, (len(index), 6, side**2))
         moves = fits.depth[:, None, None] * np.concatenate([np.stack(by, axis=1), twofold, fourfold], axis=1)
         images = np.concatenate([moves, value[:, None], surface], axis=1)
         root = np.sqrt(valid / noise.variance_at(fits.background[:, None] + fits.depth[:, None] * value))
