@@ -101,13 +101,7 @@ def settle(
     alone, level = free & ~edged & ~drawn & (balls.chi2_ring < EDGE), mean_beside(places, len(free))
     told = alone & np.isfinite(level)
     clear = balls.rows(alone & (balls.chi2_ring < STRUCTURE))
-    alike = Common(
-        optics,
-        noise,
-        under,
-        usual_size(clear),
-        around.differ,
-    )
+    alike = Common(optics, noise, under, usual_size(clear), around.differ)
     clear_drawn = balls.rows(free & drawn & ~edged & (balls.chi2_ring < STRUCTURE))
     by_spot = replace(alike, size=usual_size(clear_drawn), spot=found.spot)
     single = free & ~drawn

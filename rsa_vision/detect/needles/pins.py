@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.optics import CAP
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, middle, turned, unexplained
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, either_way, middle, unexplained
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
@@ -116,7 +116,7 @@ def _found_from(
     even = replace(optics, uneven=(0.0, 0.0))  # which way of those is the best does not hang on that, and it takes a table for each angle
     fits = [[_refit(film, replace(f, shape=shape), even, noise) for shape in shapes] for f, shapes in zip(rough, starts, strict=True)]
     if len(trials) > 1:  # optics were guessed at first: whichever way round a pin began says little
-        fits = [[*ways, *(_refit_turned(film, f, even, noise) for f in ways)] for ways in fits]
+        fits = [[*ways, *(_refit(film, either_way(f)[1], even, noise) for f in ways)] for ways in fits]
     best = [min(ways, key=unexplained) for ways in fits]
     pins = pointed(film, distinct_pins(_still(best, noise)), optics, noise)
     if len(pins) >= LEAST_OF_A_KIND:  # then there may be others, with as sharp a point on another length
@@ -269,10 +269,6 @@ def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
 def _still(pins: list[NeedleFit], noise: NoiseModel) -> list[NeedleFit]:
     """Leave out what looks like none."""
     return [f for f in pins if is_pin(f, noise, STANDS_OUT_ROUGHLY)]
-
-
-def _refit_turned(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
-    return fit_needles(film, *turned(fit), fit.shape, optics, noise)
 
 
 def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> NeedleFit:
