@@ -106,6 +106,20 @@ def test_where_many_images_are_two_balls_nearly_in_one_beam() -> None:
     assert flagged <= 0.02 * singles
 
 
+def test_what_all_clear_images_show_is_no_second_ball() -> None:
+    """Beams and blurs that no model knows leave of any depth the same part: where hardly any noise hides that, balls stay single ones."""
+    rng = np.random.default_rng(1)
+    truth, radius = grid_of_balls(rng, 6, 90.0, (3.0, 3.0))
+    clear = np.arange(len(truth)) % 3 > 0
+    angle, half = rng.uniform(0, 2 * np.pi, len(truth)), clear * rng.uniform(0.13, 0.19, len(truth)) * radius
+    off = half[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    either = [film_of_balls((620, 620), truth + to * off, radius, depth=np.where(clear, 0.3, 0.03)) for to in (1, -1)]
+    found = detect_markers(stored(sum(either) / 2 + 12.0 * rng.standard_normal((620, 620))), bits=16).images
+    gap = np.hypot(*(truth[clear, None] - found.position_px).transpose(2, 0, 1))
+    assert gap.min(axis=1).max() < 0.05
+    assert (found.flags[gap.argmin(axis=1)] == 0).all()
+
+
 @pytest.mark.parametrize("turned", [0.0, 0.6])
 def test_squares_are_no_balls(turned: float) -> None:
     """Dots of burnt-in text, as large as balls and as sharp: all alike, so that they are not odd among each other, and alone on a film."""

@@ -32,6 +32,8 @@ _AMONG_OTHERS = 3.2  # the same where most images are oblong: one in five
 _MEDIAN = 1.386  # of that
 # what an image leaves over what those leave that fit best; chi2 beyond the usual outline of those, for the latter
 _MUCH_LEFT, _MORE_LEFT, _SURE_OF_MORE = 3.0, 1.6, 28.0
+_CLEAR = 0.25  # of the usual squared depth over noise, from which an error of the model would show
+_OF_MODEL = 3.0  # times the errors of the model of the balls that have least, which any may have
 _QUIET = 0.5  # chi2 beside balls: filters that leave less noise there than under them make outlines as well
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
@@ -80,7 +82,8 @@ def are_not_round(film: NDArray[Any], balls: BallFits, beside: Beside, optics: O
         best = np.argsort(balls.chi2_core)[: max(_LEAST_KNOWN // 2, len(told) // 4)]
         usually = np.maximum(balls.chi2_ring, 1.0) * np.median(balls.chi2_core[best])
         beyond = chance / max(1.0, float(np.median(chance[best])) / _MEDIAN)
-        much_left, more_left = (balls.chi2_core > times * usually for times in (_MUCH_LEFT, _MORE_LEFT))
+        over = balls.chi2_core - _model_error(balls, noise)
+        much_left, more_left = (over > times * usually for times in (_MUCH_LEFT, _MORE_LEFT))
         left = (much_left & (chance > _SURE)) | (more_left & (beyond > _SURE_OF_MORE))
         told |= left & (length > _LEAST_OF_LARGER) & (np.median(balls.chi2_ring) > _QUIET)
     if np.count_nonzero(hidden := balls.hidden != 0) >= _OF_A_KIND:  # backgrounds that are not seen bend as an outline would have them
@@ -92,6 +95,16 @@ def are_not_round(film: NDArray[Any], balls: BallFits, beside: Beside, optics: O
         told |= (chance > _AMONG_OTHERS) & (length > _MUCH)
     square = chi2(outlines[:, 2:], covariance[:, 2:, 2:]) > _BEYOND_DOUBT
     return np.asarray(told | (square & (np.hypot(*outlines[:, 2:].T) > _CORNERS * balls.radius_px)))
+
+
+def _model_error(balls: BallFits, noise: NoiseModel) -> Float:
+    """What beams and blurs that the model does not know may leave under balls, in units of the noise, as it goes with their depth.
+
+    The quarter of the clear ones that leaves least of its depth tells it: those are single ones, or resolved.
+    """
+    clear = balls.depth**2 / noise.variance_at(balls.background)
+    share = np.maximum(balls.chi2_core - 1, 0.0) / clear
+    return np.asarray(_OF_MODEL**2 * np.quantile(share[clear > _CLEAR * np.median(clear)], 0.25) * clear)
 
 
 def _larger(radius_px: Float) -> Bool:
