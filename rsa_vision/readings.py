@@ -23,6 +23,7 @@ LOOKS_DOUBTFUL: Final = int(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SA
 """Images whose size and contrast say little of their markers."""
 OBJECT_SHAPE: Final = "ball"
 _MOST_TOLD: Final = 3  # places of one film that a message lists
+_SOME_PINS: Final = 2  # images: a single one may be a part of something else
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,6 +189,15 @@ def lonely_images(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[
         if len(lonely):
             found.append(("marker-one-view", f"{table.films[number].path.name}: {_told(table.points.position_px[lonely])}"))
     return found
+
+
+def pins_left(table: Readings, free: Bool) -> list[Finding]:
+    """Find clear single pins that no mark of the cage explains: object markers are balls, so that these have no coordinates."""
+    left = np.flatnonzero(free & (table.points.shape == "pin") & (table.points.flags == 0))
+    if len(left) < _SOME_PINS:
+        return []
+    on = ", ".join(table.films[k].path.name for k in np.unique(table.points.film[left]))
+    return [("pins-unpaired", f"{len(left)} images of single pins ({on}) have no coordinates: object markers are balls")]
 
 
 def _told(position_px: Float) -> str:
