@@ -23,10 +23,11 @@ SKEW, STEP = 0.1, 0.05  # for derivatives: by the skew; by the logarithms of att
 LOG_GRID = math.log(GRID)
 _OF_TABLE = 1 / 4  # variance, in cells, that the mean over a cell and linear interpolation between nodes add to the blur
 _KERNEL, _UNBLURRED = 4.5, np.ones(1, np.float32)  # standard deviations to which a kernel goes; one of none
+_KEPT = 96  # tables: as many as the needles of a film ask for at once; of long ones 256 took three times the memory of the film
 _PAD, _FADED = 5.0, 4.0  # blur widths around the needle that a table covers; beyond which noise lets nothing be seen
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=_KEPT)
 def _opacity(
     half_width: float,
     length: float,
@@ -76,7 +77,7 @@ def _unfolded(half: Single) -> Single:
     return np.concatenate([half[:, :0:-1], half], axis=1)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=_KEPT)
 def _unblurred(
     half_width: float,
     length: float,
@@ -178,7 +179,7 @@ def table_for(
     return (half_width, length, round(taper, 3), near), first, middle, (middle[0] - rim, middle[1] - rim)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=_KEPT)
 def table(half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str) -> Single:
     """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
