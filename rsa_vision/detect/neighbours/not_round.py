@@ -33,7 +33,10 @@ _MEDIAN = 1.386  # of that
 # what an image leaves over what those leave that fit best; chi2 beyond the usual outline of those, for the latter
 _MUCH_LEFT, _MORE_LEFT, _SURE_OF_MORE = 3.0, 1.6, 28.0
 _CLEAR = 0.25  # of the usual squared depth over noise, from which an error of the model would show
-_OF_MODEL = 3.0  # times the errors of the model of the balls that have least, which any may have
+_OF_MODEL, _MOST_OF_MODEL = (
+    3.0,
+    0.03,
+)  # times the errors of the model that those have which have least; part of the depth: more are none of balls
 _QUIET = 0.5  # chi2 beside balls: filters that leave less noise there than under them make outlines as well
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
@@ -104,7 +107,8 @@ def _model_error(balls: BallFits, noise: NoiseModel) -> Float:
     """
     clear = balls.depth**2 / noise.variance_at(balls.background)
     share = np.maximum(balls.chi2_core - 1, 0.0) / clear
-    return np.asarray(_OF_MODEL**2 * np.quantile(share[clear > _CLEAR * np.median(clear)], 0.25) * clear)
+    usual = float(np.quantile(share[clear > _CLEAR * np.median(clear)], 0.25))
+    return np.asarray(min(_OF_MODEL**2 * usual, _MOST_OF_MODEL**2) * clear)
 
 
 def _larger(radius_px: Float) -> Bool:
