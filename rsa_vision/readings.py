@@ -197,7 +197,8 @@ def pins_left(table: Readings, free: Bool) -> list[Finding]:
     if len(left) < _SOME_PINS:
         return []
     on = ", ".join(table.films[k].path.name for k in np.unique(table.points.film[left]))
-    return [("pins-unpaired", f"{len(left)} images of single pins ({on}) have no coordinates: object markers are balls")]
+    told = f"{len(left)} images of single pins ({on}) have no coordinates: object markers are balls"
+    return [("pins-unpaired", f"{told}; to measure pins, name their tips in images.csv and give it to reconstruct")]
 
 
 def _told(position_px: Float) -> str:

@@ -1,3 +1,5 @@
+"""Which places are near which others, told by a tree as by all distances."""
+
 from __future__ import annotations
 
 import numpy as np

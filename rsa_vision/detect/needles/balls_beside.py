@@ -62,15 +62,12 @@ def under_balls(balls: BallFits, optics: Optics, cols: Float, rows: Float) -> Bo
 
 def mask_under(box: Box, balls: BallFits, optics: Optics) -> None:
     """Put NaN where balls hide what is under them, in place."""
-    n_rows, n_cols = box.values.shape
-    for k, at in enumerate(balls.position_px - box.corner_px):
-        reach = balls.radius_px[k] + _FADED * optics.sigma_px
-        (left, top), (right, bottom) = (
-            np.clip(np.rint(at) + step, 0, (n_cols, n_rows)).astype(np.intp) for step in (-reach - 1, reach + 2)
-        )
-        rows, cols = np.mgrid[top:bottom, left:right].astype(np.float64)
-        hidden = np.hypot(cols - at[0], rows - at[1]) < reach
-        box.values[top:bottom, left:right][hidden] = np.nan
+    size = box.values.shape[::-1]
+    reach = balls.radius_px[:, None] + _FADED * optics.sigma_px + 1
+    low, high = (np.clip(np.rint(balls.position_px + to) - box.corner_px, 0, size).astype(np.intp) for to in (-reach, reach + 1))
+    for k, ((left, top), (right, bottom)) in enumerate(zip(low, high, strict=True)):
+        rows, cols = np.mgrid[top:bottom, left:right] + box.corner_px[::-1, None, None].astype(np.float64)
+        box.values[top:bottom, left:right][under_balls(balls.rows([k]), optics, cols, rows)] = np.nan
 
 
 def lapped(pins: list[NeedleFit], balls: BallFits, optics: Optics) -> Bool:

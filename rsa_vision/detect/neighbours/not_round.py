@@ -33,10 +33,8 @@ _MEDIAN = 1.386  # of that
 # what an image leaves over what those leave that fit best; chi2 beyond the usual outline of those, for the latter
 _MUCH_LEFT, _MORE_LEFT, _SURE_OF_MORE = 3.0, 1.6, 28.0
 _CLEAR = 0.25  # of the usual squared depth over noise, from which an error of the model would show
-_OF_MODEL, _MOST_OF_MODEL = (
-    3.0,
-    0.03,
-)  # times the errors of the model that those have which have least; part of the depth: more are none of balls
+# times the errors of the model that those have which have least; part of the depth: larger ones are none of a model of balls
+_OF_MODEL, _MOST_OF_MODEL = 3.0, 0.03
 _QUIET = 0.5  # chi2 beside balls: filters that leave less noise there than under them make outlines as well
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
