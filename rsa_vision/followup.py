@@ -125,7 +125,7 @@ def _name_by_segments(exam: _Exam, earlier: Sequence[_Exam], segments: Sequence[
     if any(turn is None for turn in before):
         before = [_beside(k, matched) if turn is None else turn for k, turn in enumerate(before)]
         matched = match_segments(bodies, exam.cloud, limits.posterior, before)
-    sightings = find_sightings(exam.rows, exam.cloud, bodies, matched, limits)
+    matched, sightings = _with_single_images(exam, bodies, matched, before, limits)
     for segment, body, known, sighting in zip(segments, bodies, matched, sightings, strict=True):
         for i, a in (*known.pairs, *known.loose, *sighting.pairs):
             exam.names[a] = f"{segment.name}/{segment.markers[i]}"
@@ -154,6 +154,25 @@ def _name_by_segments(exam: _Exam, earlier: Sequence[_Exam], segments: Sequence[
     extra = [name_of(row) for row, name in zip(exam.located, exam.names, strict=True) if not name]
     if extra:
         exam.findings.append(("marker-mismatch", f"{len(extra)} markers belong to no known segment"))
+
+
+def _with_single_images(
+    exam: _Exam, bodies: Sequence[Cloud], matched: list[Known], before: Sequence[Float | None], limits: Limits
+) -> tuple[list[Known], list[Sighting]]:
+    """Look at single images, and again at the segments still in doubt among the points that are left when these have decided others."""
+    while True:
+        sightings = find_sightings(exam.rows, exam.cloud, bodies, matched, limits)
+        both = list(zip(matched, sightings, strict=True))
+        doubted = [k for k, (known, sighting) in enumerate(both) if known.placement is None and sighting.placement is None]
+        if not doubted or len(doubted) == sum(known.placement is None for known in matched):
+            return matched, sightings  # nothing is in doubt, or single images decided nothing
+        taken = {a for known, sighting in both for _, a in (*known.pairs, *known.loose, *sighting.pairs)}
+        left = np.array([a for a in range(len(exam.cloud)) if a not in taken], dtype=np.int64)
+        again = match_segments([bodies[k] for k in doubted], exam.cloud.rows(left), limits.posterior, [before[k] for k in doubted])
+        found = {k: known.among(left) for k, known in zip(doubted, again, strict=True)}
+        matched = [found.get(k, known) for k, known in enumerate(matched)]
+        if all(known.placement is None for known in found.values()):
+            return matched, sightings
 
 
 def _segment_findings(segment: Segment, known: Known, sighting: Sighting, limits: Limits) -> list[Finding]:

@@ -59,18 +59,22 @@ def find_sightings(rows: Rows, cloud: Cloud, bodies: Sequence[Cloud], matched: S
     if not len(rays):
         return [nothing] * len(bodies)
     volume = max(volume_mm3(cloud) for cloud in (cloud, *bodies))
-    taken = {a for known in matched for _, a in (*known.pairs, *known.loose, *known.doubtful)}
-    free = np.array([a for a in range(len(cloud)) if a not in taken], dtype=np.int64)
+    lost = [index for index, known in enumerate(matched) if known.placement is None]
+    doubtful = {a for index in lost for _, a in matched[index].doubtful}
+    taken = {a for known in matched for _, a in (*known.pairs, *known.loose, *known.doubtful)} - doubtful
+    mine = np.array([a for a in range(len(cloud)) if a not in taken], dtype=np.int64)
+    present = PRESENT if len(lost) < len(matched) else 0.5
+    some = [bodies[index] for index in lost]
+    by_rays = find_with_rays(some, cloud.rows(mine), rays, volume, limits.posterior, around_mm=cloud.position_mm, present=present)
+    competing = dict(zip(lost, by_rays, strict=True))
     found = []
-    for body, known in zip(bodies, matched, strict=True):
+    for index, (body, known) in enumerate(zip(bodies, matched, strict=True)):
         if known.placement is not None:
             seen = known.pairs if not known.loose else tuple(pair for pair in known.pairs if pair not in known.loose)
             missing = set(known.lost)
             sighting = hidden_markers(body, cloud, seen, known.placement, rays, missing, volume, limits.posterior)
         else:
-            mine = np.union1d(free, np.array([a for _, a in known.doubtful], np.int64)).astype(np.int64)
-            present = PRESENT if any(other.placement is not None for other in matched) else 0.5
-            sighting = find_with_rays(body, cloud.rows(mine), rays, volume, limits.posterior, around_mm=cloud.position_mm, present=present)
+            sighting = competing[index]
             sighting = replace(sighting, pairs=tuple((i, int(mine[a])) for i, a in sighting.pairs))
             if not (sighting.sights if sighting.decisive else not known.doubtful):
                 sighting = nothing  # points tell nothing here that they did not tell by themselves, and their doubt says it all

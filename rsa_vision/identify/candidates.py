@@ -32,6 +32,7 @@ THIN_MM: Final = 1.0  # height of a triangle that determines no pose
 ALIKE: Final = 4.0  # variances of predicted places are alike up to this ratio
 CHUNK: Final = 1000  # poses that are fitted at once
 MOST_CLIMBED: Final = 40  # assignments from which better ones are sought
+FOUND: Final = 0.9  # probability that a marker of a known body is among the points
 LOOSE: Final = 0.02  # probability that a marker found has moved in its bone
 LOOSE_MM: Final = 3.0  # how far a marker may have moved in its bone and still be known by its place
 

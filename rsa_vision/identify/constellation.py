@@ -14,12 +14,11 @@ import numpy as np
 from scipy.special import expit, gammaln
 
 from rsa_vision.geometry.rigid import LEAST_POINTS
-from rsa_vision.identify.candidates import LOOSE, LOOSE_MM, candidate_poses, disjoint, loose_triples
+from rsa_vision.identify.candidates import FOUND, LOOSE, LOOSE_MM, candidate_poses, disjoint, loose_triples
 from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import GATE, Cloud, Pairs, Placement, nearness, place, volume_mm3
 from rsa_vision.types import Bool, Float, Int
 
-FOUND: Final = 0.9  # probability that a marker of a known segment is among the points
 STRAY: Final = 3.0  # expected points that belong to nothing known, at least
 LOOSE_SIGMA: Final = 4.0  # residual of a marker that has moved
 TURN_RAD: Final = 0.5  # sd of the rotation of a body about each axis since it was seen before,
@@ -52,6 +51,11 @@ class Known:
     loose: Pairs
     lost: tuple[int, ...]
     placement: Placement | None
+
+    def among(self, rows: Int) -> Known:
+        """Return this of all points, if it was found among some of them: these rows."""
+        pairs, doubtful, loose = (tuple((i, int(rows[a])) for i, a in some) for some in (self.pairs, self.doubtful, self.loose))
+        return Known(pairs, doubtful, loose, self.lost, self.placement)
 
 
 def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float, before: Sequence[Float | None] | None = None) -> list[Known]:

@@ -7,16 +7,16 @@ marker competes as the names do (:mod:`constellation`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import logsumexp
 
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.geometry.rigid import LEAST_POINTS
-from rsa_vision.identify.constellation import FOUND, NEGLIGIBLE, STRAY
+from rsa_vision.identify.candidates import FOUND
+from rsa_vision.identify.constellation import MOST_RIVALS, NEGLIGIBLE, STRAY, likely_groups
 from rsa_vision.identify.hidden_starts import Scene, Start, first_poses
 from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import (
@@ -106,7 +106,7 @@ def hidden_markers(
 
 
 def find_with_rays(
-    body: Cloud,
+    bodies: Sequence[Cloud],
     points: Cloud,
     rays: RayBundle,
     volume: float,
@@ -114,34 +114,68 @@ def find_with_rays(
     *,
     around_mm: Float | None = None,
     present: float = 0.5,
-) -> Sighting:
-    """Find a segment whose points alone do not tell its pose, with rays that belong to nothing, or by these alone.
+) -> list[Sighting]:
+    """Find segments whose points alone do not tell their poses, with rays that belong to nothing, or by these alone.
 
     Parameters
     ----------
-    body, points : Cloud
-        `points` that belong to no other segment.
+    bodies : sequence of Cloud
+        All segments that may have these points and rays: they compete for them.
+    points : Cloud
+        Those that belong to no other segment.
     rays : RayBundle
     volume : float
     posterior : float
     around_mm : ndarray of shape (k, 3), optional
         Places of other markers: how deep along the rays to look. Default: anywhere from the film to near the foci.
     present : float
-        Probability that the segment is on the films at all, before they are looked at.
+        Probability that a segment is on the films at all, before they are looked at.
 
     Returns
     -------
-    Sighting
-        The best assignment and pose; ``decisive`` only if all others together, and chance, leave it the probability `posterior`.
+    list of Sighting
+        One of each segment: its assignment and pose in the best explanation of all; ``decisive`` only if all others together, and chance,
+        leave it the probability `posterior`.
 
     Notes
     -----
     Two places begin a hypothesis: points of two markers with their distance, or a point and where a ray pierces the sphere about it on
     which another marker must lie. The body is turned about the line through both, and where a third marker meets a ray its pose is fitted
     and grown. So is every pose at which three markers lie on three rays (:mod:`ray_triples`) and a fourth one near another. Beside each
-    assignment stand those in which a marker has another ray near it.
+    assignment stand those in which a marker has another ray near it, and those of points alone. All explanations by all bodies are summed,
+    each point and each image once: what one body alone would explain surely may be another's as well.
     """
-    scene = Scene(body, points, rays, volume, STRAY + len(points))
+    hypotheses = [_hypotheses(Scene(body, points, rays, volume, STRAY + len(points)), around_mm) for body in bodies]
+    listed = [(index, *one) for index, (every, _) in enumerate(hypotheses) for one in every]
+    n = len(bodies)
+    claims = [
+        (index, *(n + a for _, a in pairs), *{n + len(points) + int(rays.image[r]) for _, r in sights})
+        for index, _, (pairs, sights), _ in listed
+    ]
+    packing = pack(claims, np.array([odds for _, odds, _, _ in listed]) - float(np.log(1 / present - 1)))
+    chances = np.nan_to_num(packing.posterior)
+    found = []
+    for index, (body, (_, untried)) in enumerate(zip(bodies, hypotheses, strict=True)):
+        mine = [g for g, one in enumerate(listed) if one[0] == index]
+        best = next((g for g in mine if packing.chosen[g]), None)
+        if best is None:
+            found.append(Sighting((), (), None, False))
+            continue
+        _, _, key, placement = listed[best]
+        same = [(float(chances[g]), *listed[g][2]) for g in mine if _alike(body, placement, listed[g][3])]
+        pairs, sights, sure = _surest(key, same, posterior)
+        markers = {i for i, _ in (*pairs, *sights)}
+        decisive = sure and len(markers) >= LEAST_POINTS and untried < len(markers)
+        if decisive and (pairs, sights) != key:
+            fitted = place_with_rays(body, points, pairs, rays, sights, placement.rotation, placement.translation)
+            decisive, placement = fitted is not None, fitted or placement
+        found.append(Sighting(pairs, sights, placement, decisive))
+    return found
+
+
+def _hypotheses(scene: Scene, around_mm: Float | None) -> tuple[list[tuple[float, tuple[Pairs, Pairs], Placement]], int]:
+    """List the likeliest assignments of a body with their log odds, and say how many markers what was not tried might meet."""
+    body = scene.body
     starts = first_poses(scene, around_mm)
     found: dict[tuple[Pairs, Pairs], list[Placement]] = {}
 
@@ -150,6 +184,8 @@ def find_with_rays(
         if not any(_alike(body, placement, other) for other in same):
             same.append(placement)
 
+    for _, pairs, placement in likely_groups(body, scene.points, scene.volume, scene.stray):
+        add(pairs, (), placement)
     for start in starts[:MOST_TRIED]:
         if (grown := _grown(scene, start)) is not None:
             add(*grown)
@@ -161,28 +197,22 @@ def find_with_rays(
                 add(*other, fit)
     every = [(_log_odds(scene, *key, placement), key, placement) for key, placements in found.items() for placement in placements]
     every = sorted((one for one in every if one[0] > NEGLIGIBLE), key=lambda one: (-one[0], one[1]))
-    if not every:
-        return Sighting((), (), None, False)
-    total = float(logsumexp([np.log(1 / present - 1), *(one[0] for one in every)]))
-    _, (pairs, sights), placement = every[0]
-    same = [(odds, {*key[0]}, {*key[1]}) for odds, key, other in every if _alike(body, placement, other)]
+    return every[:MOST_RIVALS], starts[MOST_TRIED].met if len(starts) > MOST_TRIED else 0
+
+
+def _surest(key: tuple[Pairs, Pairs], same: Sequence[tuple[float, Pairs, Pairs]], posterior: float) -> tuple[Pairs, Pairs, bool]:
+    """Return what of an assignment is sure together, by the chances of all at its pose; the least sure have no name."""
 
     def chance(some_pairs: Pairs, some_sights: Pairs) -> float:
-        holding = [odds for odds, one, two in same if one.issuperset(some_pairs) and two.issuperset(some_sights)]
-        return float(np.exp(logsumexp(holding) - total)) if holding else 0.0
+        return sum(one for one, pairs, sights in same if {*some_pairs} <= {*pairs} and {*some_sights} <= {*sights})
 
+    pairs, sights = key
     doubts = sorted([(chance((pair,), ()), pair, 0) for pair in pairs] + [(chance((), (sight,)), sight, 1) for sight in sights])
-    while doubts and chance(pairs, sights) < posterior:  # the least sure have no name
+    while doubts and chance(pairs, sights) < posterior:
         _, doubted, kind = doubts.pop(0)
         pairs = tuple(pair for pair in pairs if kind or pair != doubted)
         sights = tuple(sight for sight in sights if not kind or sight != doubted)
-    markers = {i for i, _ in (*pairs, *sights)}
-    untried = starts[MOST_TRIED].met if len(starts) > MOST_TRIED else 0  # as many markers might be met there
-    decisive = len(markers) >= LEAST_POINTS and chance(pairs, sights) >= posterior and untried < len(markers)
-    if decisive and (pairs, sights) != every[0][1]:
-        fitted = _fitted(scene, pairs, sights, placement)
-        decisive, placement = fitted is not None, fitted or placement
-    return Sighting(pairs, sights, placement, decisive)
+    return pairs, sights, chance(pairs, sights) >= posterior
 
 
 def _alike(body: Cloud, one: Placement, other: Placement) -> bool:

@@ -53,7 +53,7 @@ def test_a_segment_with_fewer_than_three_points_is_found_by_its_rays(n: int, bot
     decisive = 0
     for _ in range(4):
         body, places, points, names, rays, seen = scene(rng, n, both, single, 1)
-        found = find_with_rays(Cloud.exact(body), points, rays, 1e5, POSTERIOR)
+        (found,) = find_with_rays([Cloud.exact(body)], points, rays, 1e5, POSTERIOR)
         if found.decisive:
             decisive += 1
             assert all(names[a] == i for i, a in found.pairs)
@@ -66,15 +66,15 @@ def test_what_does_not_determine_a_pose_is_not_decisive() -> None:
     rng = np.random.default_rng(8)
     for both, single in ((1, 2), (2, 1)):
         body, _, points, _, rays, _ = scene(rng, 5, both, single, 0)
-        assert not find_with_rays(Cloud.exact(body), points, rays, 1e5, POSTERIOR).decisive
+        assert not find_with_rays([Cloud.exact(body)], points, rays, 1e5, POSTERIOR)[0].decisive
 
 
 def test_a_symmetric_body_has_more_than_one_pose() -> None:
     rng = np.random.default_rng(9)
     square = np.array([[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0.0]])
     places = square + np.array([0, 100, 150.0])
-    found = find_with_rays(
-        Cloud.exact(square), measured(rng, places[:2], 0.01), seen_from(rng, places[2:], np.array([0, 1])), 1e5, POSTERIOR
+    (found,) = find_with_rays(
+        [Cloud.exact(square)], measured(rng, places[:2], 0.01), seen_from(rng, places[2:], np.array([0, 1])), 1e5, POSTERIOR
     )
     assert found.placement is not None
     assert not found.decisive
@@ -86,8 +86,8 @@ def test_a_segment_without_any_point_is_found_by_rays_of_one_focus_with_true_err
     for _ in range(3):
         body, places, points, _, _, seen = scene(rng, 6, 0, 6, 2)
         one = seen_from(rng, np.concatenate([places[seen[:6]], places[:2] + rng.normal(0, 15, (2, 3))]), np.zeros(8, int))
-        found = find_with_rays(Cloud.exact(body), points, one, 1e5, POSTERIOR, around_mm=places + rng.normal(0, 20, places.shape))
-        mirrored = find_with_rays(Cloud.exact(body * [-1, 1, 1]), points, one, 1e5, POSTERIOR, around_mm=places)
+        (found,) = find_with_rays([Cloud.exact(body)], points, one, 1e5, POSTERIOR, around_mm=places + rng.normal(0, 20, places.shape))
+        (mirrored,) = find_with_rays([Cloud.exact(body * [-1, 1, 1])], points, one, 1e5, POSTERIOR, around_mm=places)
         assert not mirrored.decisive
         if found.decisive:
             decisive += 1
@@ -108,7 +108,7 @@ def test_an_image_beside_a_hidden_marker_takes_its_name_from_neither_or_the_righ
         body, places, points, _, _, seen = scene(rng, 6, 2, 4, 0)
         beside = places[seen[:1]] + np.array([0.25, 0.1, 0])
         rays = seen_from(rng, np.concatenate([places[seen], beside]), np.zeros(5, int))
-        found = find_with_rays(Cloud.exact(body), points, rays, 1e5, POSTERIOR)
+        (found,) = find_with_rays([Cloud.exact(body)], points, rays, 1e5, POSTERIOR)
         if found.decisive:
             assert all(r < 4 and seen[r] == i for i, r in found.sights)
             named += len(found.sights)
