@@ -7,7 +7,7 @@ of the probabilities of all that give it. Below the limit there is no name.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,6 +17,7 @@ from rsa_vision.geometry.rigid import LEAST_POINTS
 from rsa_vision.identify.candidates import FOUND, LOOSE, LOOSE_MM, candidate_poses, disjoint, loose_triples
 from rsa_vision.identify.packing import pack
 from rsa_vision.identify.poses import GATE, Cloud, Pairs, Placement, nearness, place, volume_mm3
+from rsa_vision.identify.twins import twins
 from rsa_vision.types import Bool, Float, Int
 
 STRAY: Final = 3.0  # expected points that belong to nothing known, at least
@@ -79,16 +80,18 @@ def match_segments(segments: Sequence[Cloud], points: Cloud, posterior: float, b
     """
     volume = volume_mm3(points)
     stray = STRAY + max(0, len(points) - sum(map(len, segments)))
-    rivals = [(index, *rival) for index, body in enumerate(segments) for rival in _rivals(body, points, volume, stray)]
-    claims = [(*(a for _, a in (*rigid, *loose)), len(points) + index) for index, _, rigid, loose, _ in rivals]
+    rivals = [rival for index, body in enumerate(segments) for rival in _rivals(index, body, points, volume, stray)]
+    rivals += _twins(segments, points, rivals, volume, stray)
+    claims = [(*(a for _, a in (*rival.rigid, *rival.loose)), *rival.beyond, len(points) + rival.body) for rival in rivals]
     since = [None] * len(segments) if before is None else before
-    usual = [0.0 if (turn := since[index]) is None else log_usual(turn, after) for index, *_, after in rivals]
-    chosen, chances = _packed(claims, [odds for _, odds, *_ in rivals], usual)
+    usual = [0.0 if (turn := since[rival.body]) is None else log_usual(turn, rival.rotation) for rival in rivals]
+    chosen, chances = _packed(claims, [rival.odds for rival in rivals], usual)
     known = []
     for index, segment in enumerate(segments):
-        mine = [g for g, rival in enumerate(rivals) if rival[0] == index]
-        names = _names([(*rivals[g][2], *rivals[g][3]) for g in mine], chances[:, mine])
-        rigid, loose = next((rivals[g][2:4] for g in mine if chosen[g]), ((), ()))
+        mine = [g for g, rival in enumerate(rivals) if rival.body == index]
+        names = _names([(*rivals[g].rigid, *rivals[g].loose) for g in mine], chances[:, mine])
+        best = next((rivals[g] for g in mine if chosen[g]), None)
+        rigid, loose = ((), ()) if best is None else (best.rigid, best.loose)
         known.append(_known(segment, points, rigid, loose, names, posterior))
     return _with_loose(segments, points, known)
 
@@ -128,25 +131,49 @@ def likely_groups(segment: Cloud, points: Cloud, volume: float, stray: float) ->
     return [(odds, pairs, found[pairs]) for odds, pairs in rivals[:MOST_RIVALS]]
 
 
-def _rivals(segment: Cloud, points: Cloud, volume: float, stray: float) -> list[tuple[float, Pairs, Pairs, Float]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rival:
+    """An assignment of a segment, with a marker that has moved, and points of markers that nobody knew."""
+
+    body: int
+    odds: float
+    rigid: Pairs
+    loose: Pairs
+    rotation: Float
+    beyond: tuple[int, ...] = ()
+
+
+def _rivals(index: int, segment: Cloud, points: Cloud, volume: float, stray: float) -> list[_Rival]:
     """List the assignments of a segment, as they are and with one marker more that has moved in its bone: anywhere near its place.
 
     Without the latter a wrong assignment of all markers competes neither with the true one of those that have not moved, which may be two
-    alone, nor with a stray point that happens to lie where the marker that moved is missing. With each goes the body's rotation.
+    alone, nor with a stray point that happens to lie where the marker that moved is missing.
     """
     gain = np.log(LOOSE * FOUND / (1 - FOUND) * volume / stray / (4 / 3 * np.pi * LOOSE_MM**3))
     groups = likely_groups(segment, points, volume, stray)
-    rivals: list[tuple[float, Pairs, Pairs, Float]] = []
+    rivals: list[_Rival] = []
     for odds, pairs, placement in groups:
         lost, free = _others(len(segment), dict(pairs).keys()), _others(len(points), dict(pairs).values())
         away = np.linalg.norm(points.position_mm[free] - placement.predict(segment.position_mm[lost])[0][:, None], axis=-1)
         near = [((int(lost[i]), int(free[a])),) for i, a in np.argwhere(away < LOOSE_MM).tolist()]
-        rivals += [(odds, pairs, (), placement.rotation), *((odds + float(gain), pairs, one, placement.rotation) for one in near)]
+        rivals.append(_Rival(index, odds, pairs, (), placement.rotation))
+        rivals += [_Rival(index, odds + float(gain), pairs, one, placement.rotation) for one in near]
     triples = [pairs for _, pairs, _ in groups if len(pairs) == LEAST_POINTS]
     for pairs, placement in loose_triples(segment, points, triples):
-        rivals.append((log_odds(len(segment), placement, pairs, volume, stray), pairs[:2], pairs[2:], placement.rotation))
-    rivals = [rival for rival in rivals if rival[0] > NEGLIGIBLE]
-    return sorted(rivals, key=lambda rival: (-rival[0], rival[1:3]))[:MOST_RIVALS]
+        rivals.append(_Rival(index, log_odds(len(segment), placement, pairs, volume, stray), pairs[:2], pairs[2:], placement.rotation))
+    rivals = [rival for rival in rivals if rival.odds > NEGLIGIBLE]
+    return sorted(rivals, key=lambda rival: (-rival.odds, rival.rigid, rival.loose))[:MOST_RIVALS]
+
+
+def _twins(segments: Sequence[Cloud], points: Cloud, rivals: Sequence[_Rival], volume: float, stray: float) -> list[_Rival]:
+    """List the assignments once more with what else they may explain if segments are alike."""
+    first = np.cumsum([0, *map(len, segments)]).tolist()
+    rigid = {tuple((first[rival.body] + i, a) for i, a in rival.rigid): rival for rival in rivals if not rival.loose}
+    if not rigid:
+        return []
+    markers = Cloud(*(np.concatenate([getattr(body, name) for body in segments]) for name in ("position_mm", "covariance_mm2")))
+    alike = twins(markers, points, [(rival.odds, pairs) for pairs, rival in rigid.items()], volume, stray, whole=True)
+    return [replace(rigid[pairs], odds=odds, beyond=beyond) for odds, pairs, beyond in alike]
 
 
 def log_odds(n: int, placement: Placement, pairs: Pairs, volume: float, stray: float) -> float:
@@ -191,8 +218,11 @@ def match_bodies(before: Cloud, points: Cloud, posterior: float) -> tuple[list[P
         few, uncounted = _counted(rivals, len(points))
         triples = [pairs for _, pairs, _ in few if pairs in rigid and len(pairs) == LEAST_POINTS]
         turned = dict(loose_triples(before, points, triples))
-        competing = [*few, *_additions(before, points, turned, named, volume)]
-        chances, best = _summed(competing, len(points))
+        alike = twins(before, points, [(odds, pairs) for odds, pairs, _ in few], volume, len(points), whole=False)
+        usual = {pairs: one for _, pairs, one in few}
+        competing = [*few, *_additions(before, points, turned, named, volume), *((odds, pairs, usual[pairs]) for odds, pairs, _ in alike)]
+        beyond = [()] * (len(competing) - len(alike)) + [more for _, _, more in alike]
+        chances, best = _summed(competing, len(points), beyond)
         chosen = [competing[g][1] for g in best]
         odds = {few[g][1]: few[g][0] for g in best if g < len(few)}  # what is best with a loose marker of three gets no names
         chances = _with_uncounted(chances, odds, uncounted)
@@ -267,9 +297,12 @@ def _counted(rivals: list[tuple[float, Pairs, float]], m: int) -> tuple[list[tup
     return few + [one for one in others if one in apart], [one for one in others if one not in apart]
 
 
-def _summed(rivals: Sequence[tuple[float, Pairs, float]], m: int) -> tuple[dict[tuple[int, int], float], list[int]]:
+def _summed(
+    rivals: Sequence[tuple[float, Pairs, float]], m: int, beyond: Sequence[tuple[int, ...]] = ()
+) -> tuple[dict[tuple[int, int], float], list[int]]:
     groups = [pairs for _, pairs, _ in rivals]
-    claims = [(*(a for _, a in pairs), *(m + i for i, _ in pairs)) for pairs in groups]
+    more = beyond or [()] * len(groups)
+    claims = [(*(a for _, a in pairs), *points, *(m + i for i, _ in pairs)) for pairs, points in zip(groups, more, strict=True)]
     chosen, chances = _packed(claims, [odds for odds, _, _ in rivals], [usual for _, _, usual in rivals])
     return _names(groups, chances), np.flatnonzero(chosen).tolist()
 
