@@ -33,11 +33,12 @@ def log_chance_of_depths(depth: Float, met: Float, weight: Float) -> Float:
     ndarray of shape (m,)
     """
     width = np.hypot(LEAST_SPREAD, float(met.std()) * len(met) ** -0.2)
-    low, high = float(min(met.min(), depth.min())) - 5 * width, float(max(met.max(), depth.max())) + 5 * width
+    steps = np.ceil(5 * width / STEP)  # the kernel is no longer than what it smooths, even about a single depth
+    low, high = float(min(met.min(), depth.min())) - steps * STEP, float(max(met.max(), depth.max())) + steps * STEP
     edges = np.arange(low, high + 2 * STEP, STEP)
     counts = np.histogram(met, edges, weights=weight + PRESUMED / len(met))[0]
     middle = (edges[:-1] + edges[1:]) / 2
-    reach = np.arange(-np.ceil(5 * width / STEP), np.ceil(5 * width / STEP) + 1) * STEP
+    reach = np.arange(-steps, steps + 1) * STEP
     kernel = np.exp(-0.5 * (reach / width) ** 2)
     density = np.convolve(counts / counts.sum(), kernel / (kernel.sum() * STEP), mode="same")
     return np.asarray(np.log(np.maximum(np.interp(depth, middle, density), np.finfo(float).tiny)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from rsa_vision.identify.crossings import Crossings
 from rsa_vision.identify.depths import log_chance_of_depths, log_odds_of_depths
@@ -17,6 +18,15 @@ def test_chance_is_a_density_of_where_images_without_a_partner_cross() -> None:
     assert np.abs(alike[(grid > -0.7) & (grid < -0.1)] - np.log(1 / 0.8)).max() < 0.3
     few = log_chance_of_depths(np.array([-0.7, -0.1]), met, np.where(met < -0.6, 1.0, 0.0))
     assert few[0] > few[1] + 3
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.001, 0.002, 0.003])
+def test_crossings_at_one_depth_are_likeliest_there(apart: float) -> None:
+    """The kernel was longer than the histogram of two crossings that lie about as deep, and the examination failed."""
+    met = -0.3 + apart * np.array([-0.5, 0.5])
+    there = log_chance_of_depths(met, met, np.ones(2))
+    assert np.exp(there) == pytest.approx(1 / (0.01 * np.sqrt(2 * np.pi)), rel=0.1)
+    assert (log_chance_of_depths(met + 0.03, met, np.ones(2)) < there - 2).all()
 
 
 def test_a_depth_among_the_markers_speaks_for_a_pair_and_one_elsewhere_against_it() -> None:
