@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final
@@ -255,14 +255,26 @@ def find_crossings(bundle: RayBundle, region: Region | None) -> tuple[Crossings,
     return crossings.among(tuple(neighbours), np.ones(len(bundle))), tuple(neighbours)
 
 
-def common_error(crossings: Crossings) -> float:
-    """Estimate a systematic error of the rays: the smallest slack with which the crossings are likely as a mixture of pairs and chance."""
-    order = np.unique(crossings.a, return_inverse=True)[1]
+def common_error(crossed: Sequence[Crossings]) -> float:
+    """Estimate a systematic error of the rays: the smallest slack with which the crossings are likely as mixtures of pairs and chance.
+
+    Parameters
+    ----------
+    crossed : sequence of Crossings
+        Of rays of different images each, mixed in parts of their own.
+
+    Returns
+    -------
+    float
+        0 unless there is evidence.
+    """
     fraction = np.array(FRACTIONS)[:, None]
-    likelihood = []
-    for slack in SLACKS_MM:
-        ratio = np.full(order.max() + 1, -np.inf)
-        np.logaddexp.at(ratio, order, crossings.with_slack(slack).log_ratio())
-        likelihood.append(float(np.logaddexp(np.log1p(-fraction), np.log(fraction) + ratio).sum(axis=1).max()))
+    likelihood = np.zeros(len(SLACKS_MM))
+    for crossings in crossed:
+        rays, order = np.unique(crossings.a, return_inverse=True)
+        for k, slack in enumerate(SLACKS_MM):
+            ratio = np.full(len(rays), -np.inf)
+            np.logaddexp.at(ratio, order, crossings.with_slack(slack).log_ratio())
+            likelihood[k] += np.logaddexp(np.log1p(-fraction), np.log(fraction) + ratio).sum(axis=1).max()
     best = int(np.argmax(likelihood))
     return SLACKS_MM[best] if likelihood[best] > likelihood[0] + SLACK_EVIDENCE else 0.0

@@ -26,8 +26,8 @@ def chance_of_marker(look: Float, place_px: Float, quality: Int, paired: Bool, s
 
     Parameters
     ----------
-    look : ndarray of shape (n, 2)
-        Logarithms of radius and contrast.
+    look : ndarray of shape (n, 2) or (n, 1)
+        Logarithms of radius and contrast, or of the radius alone.
     place_px : ndarray of shape (n, 2)
         (col, row).
     quality : ndarray of int, shape (n,)
@@ -52,11 +52,12 @@ def chance_of_marker(look: Float, place_px: Float, quality: Int, paired: Bool, s
     odds += np.log((PRESUMED[0] + PRESUMED[1] * len(teachers)) / len(lone))
     clear = teachers[quality[teachers] == 0]
     if len(clear):
+        kind, wide, unsure = (error[: look.shape[1]] for error in (KIND, WIDE, UNSURE))
         middle = np.median(look[clear], axis=0)
         for at in some_of(np.arange(len(lone)), len(clear)):
             mine = look[lone[at]]
-            width = np.hypot(KIND, np.where((quality[lone[at]] > 0)[:, None], UNSURE, 0.0))
-            anything = (log_student((mine - middle) / WIDE, 3.0) - np.log(WIDE)).sum(axis=1)
+            width = np.hypot(kind, np.where((quality[lone[at]] > 0)[:, None], unsure, 0.0))
+            anything = (log_student((mine - middle) / wide, 3.0) - np.log(wide)).sum(axis=1)
             odds[at] += log_kernels(mine, look[clear], np.ones(len(clear)), width, len(clear)) - anything
     result[lone] = expit(odds)
     return result

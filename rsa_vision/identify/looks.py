@@ -25,8 +25,8 @@ class Looks:
     ----------
     image : ndarray of int, shape (n,)
         Image of every ray.
-    of_ray : ndarray of shape (n, 2)
-        Log of apparent radius and of contrast; NaN where unknown.
+    of_ray : ndarray of shape (n, 2) or (n, 1)
+        Log of apparent radius and of contrast, or of the radius alone; NaN where unknown.
     quality : ndarray of int, shape (n,)
         Class of the image of every ray, below :data:`CLASSES`.
     a, b : ndarray of int, shape (m,)
@@ -48,7 +48,7 @@ class Looks:
 
     @property
     def unsure(self) -> Float:
-        """Error of the look of every ray, shape (n, 2)."""
+        """Error of the look of every ray, shape as `of_ray`."""
         unclear = np.where((self.quality > 0)[:, None], UNSURE[: self.of_ray.shape[1]], 0.0)
         result: Float = np.hypot(unclear, self.error[:, None])
         return result

@@ -49,13 +49,18 @@ def log_odds_of_looks(looks: Looks, pair: Float, alone: Alone, alone_by_size: Al
     Two images of different markers need no place in this ratio: the assignments that give each its own partner speak against theirs. A pair
     that does not look like one may still do so in size: bone before one image, or another exposure, changes its contrast only.
     """
-    like, unlike = _log_like(looks, pair, alone, contrast=True)
     like_in_size, unlike_in_size = _log_like(looks, pair, alone_by_size, contrast=False)
+    presumed = UNLIKE[1] + float(pair.sum())
+    if looks.of_ray.shape[1] == 1:
+        return _either(like_in_size, 0.0, (UNLIKE[0] + unlike_in_size) / presumed)
+    like, unlike = _log_like(looks, pair, alone, contrast=True)
     share = (UNLIKE[0] / 2 + unlike_in_size) / (UNLIKE[0] + np.maximum(unlike, unlike_in_size))  # of the pairs unlike in either
-    taught = float(pair.sum())
-    part = (UNLIKE[0] + unlike) / (UNLIKE[1] + taught)
-    rest = np.logaddexp(np.log1p(-share) + like_in_size, np.log(share))
-    result: Float = np.logaddexp(np.log1p(-part) + like, np.log(part) + rest)
+    return _either(like, _either(like_in_size, 0.0, share), (UNLIKE[0] + unlike) / presumed)
+
+
+def _either(log_usual: Float, log_other: Float | float, part: Float) -> Float:
+    """Return the log of a mixture of two densities, the second of which has a part."""
+    result: Float = np.logaddexp(np.log1p(-part) + log_usual, np.log(part) + log_other)
     return result
 
 
@@ -67,7 +72,9 @@ def _log_like(looks: Looks, pair: Float, alone: Alone, *, contrast: bool) -> tup
     from its focus, since bone lies before one and not before the other. How often each holds, the other pairs tell.
     """
     d = 2 if contrast else 1
-    first, second = looks.of_ray[looks.a].copy(), looks.of_ray[looks.b].copy()
+    look = np.zeros((len(looks.of_ray), 2))  # sizes alone are as at one contrast
+    look[:, : looks.of_ray.shape[1]] = looks.of_ray
+    first, second = look[looks.a], look[looks.b]
     first[:, 0] += looks.grown_a
     second[:, 0] += looks.grown_b
     known_a: Bool = np.array(np.isfinite(first).all(axis=1))

@@ -3,10 +3,14 @@
 Two rays belong together if they cross: the crossing distance in units of its own sigma, against the density with which unrelated rays would
 cross as well. Images of balls of one kind also agree in the size that their depth implies, and in contrast; how well they do is learnt from
 the pairs that are beyond doubt. All assignments are summed (:mod:`packing`): a pair carries the probability of being one.
+
+Images of two shapes show two markers. Each shape is paired for itself, with markers, looks and clutter of its own; the error of rays beyond
+their covariance is that of all.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Final
@@ -15,14 +19,14 @@ import numpy as np
 
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.alone import images_alone
-from rsa_vision.identify.crossings import Crossings, Region, common_error, find_crossings
+from rsa_vision.identify.crossings import Crossings, Neighbours, Region, common_error, find_crossings
 from rsa_vision.identify.densities import weighted_median
 from rsa_vision.identify.depths import log_odds_of_depths
 from rsa_vision.identify.looks import UNSURE, Looks
 from rsa_vision.identify.packing import Packing, components, pack
 from rsa_vision.identify.pair_looks import log_odds_of_looks
 from rsa_vision.settings import Limits
-from rsa_vision.types import Bool, Float, Int
+from rsa_vision.types import Bool, Float, Int, Str
 
 ROUNDS: Final = 5
 PRIOR: Final = (0.02, 0.95)  # bounds of the learnt fraction of rays that have a partner
@@ -73,6 +77,7 @@ def pair_rays(
     limits: Limits | None = None,
     *,
     region: Region | None = None,
+    shape: Str | None = None,
     radius_mm: Float | None = None,
     contrast: Float | None = None,
     quality: Int | None = None,
@@ -89,9 +94,12 @@ def pair_rays(
         ``crossing_sigma`` and ``posterior``.
     region : callable, optional
         Where a marker may be, as of :func:`cage_region`; default: in front of the foci.
+    shape : ndarray of str, shape (n,), optional
+        Of the ray's image; those of a marker are of one shape. Default: all alike.
     radius_mm : ndarray of shape (n,), optional
         Apparent radius at the ray's ``through_mm``; NaN where unknown.
     contrast : ndarray of shape (n,), optional
+        NaN where unknown; of shapes of which none is known sizes are compared alone.
     quality : ndarray of int, shape (n,), optional
         How well the image was fitted: 0 clear, 1 disturbed, 2 not described by the model; default: all alike.
     error : ndarray of shape (n,), optional
@@ -104,24 +112,70 @@ def pair_rays(
     Pairing
     """
     limits = limits or Limits()
+    n = len(bundle)
+    known = [np.full(n, np.nan) if values is None else values for values in (radius_mm, contrast)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        look = np.log(np.stack(known, axis=1))
+    quality = np.zeros(n, np.int64) if quality is None else quality
+    error = np.zeros(n) if error is None else np.clip(np.nan_to_num(error), 0.0, UNSURE[0])
+    shape = np.full(n, "") if shape is None else shape
+    alike = [np.flatnonzero(shape == one) for one in np.unique(shape)] or [np.arange(0)]
+    crossed = [find_crossings(bundle.rows(mine), region) for mine in alike]
+    slack = common_error([crossings for crossings, _ in crossed]) if slack_mm is None else slack_mm
+    parts = [
+        _pair_alike(bundle.rows(mine), limits, *found, slack, look[mine], quality[mine], error[mine])
+        for mine, found in zip(alike, crossed, strict=True)
+    ]
+    return _together(parts, alike, slack)
+
+
+def _together(parts: Sequence[Pairing], rows: Sequence[Int], slack: float) -> Pairing:
+    """Join the pairings of some rows of a bundle each."""
+
+    def groups(name: str) -> tuple[tuple[int, ...], ...]:
+        return tuple(tuple(mine[list(group)].tolist()) for part, mine in zip(parts, rows, strict=True) for group in getattr(part, name))
+
+    return Pairing(
+        groups("groups"),
+        np.concatenate([part.posterior for part in parts]),
+        np.concatenate([part.ambiguous for part in parts]),
+        np.concatenate([part.crossing_sigma for part in parts]),
+        np.sort(np.concatenate([part.unmatched for part in parts])),
+        slack,
+        tuple(dict.fromkeys(reason for part in parts for reason in part.reasons)),
+        groups("contested"),
+        np.concatenate([part.contested_log_odds for part in parts]),
+    )
+
+
+def _pair_alike(
+    bundle: RayBundle,
+    limits: Limits,
+    crossings: Crossings,
+    neighbours: tuple[Neighbours, ...],
+    slack: float,
+    look: Float,
+    quality: Int,
+    error: Float,
+) -> Pairing:
+    """Pair the rays of images of one shape, by where they cross and by their looks (n, 2) with their errors."""
     images = np.unique(bundle.image)
-    crossings, neighbours = find_crossings(bundle, region)
     if not len(crossings):
-        return Pairing((), np.zeros(0), np.zeros(0, bool), np.zeros(0), images, 0.0, ())
-    slack = common_error(crossings) if slack_mm is None else slack_mm
+        return Pairing((), np.zeros(0), np.zeros(0, bool), np.zeros(0), images, slack, ())
     crossings = crossings.with_slack(slack)
     crossings = crossings.rows(crossings.distance_mm < limits.crossing_sigma * crossings.sigma_mm)
-    known = _looks(bundle, crossings, radius_mm, contrast, quality, error)
+    look = look[:, : 2 if np.isfinite(look[:, 1]).any() else 1]
+    known = Looks(bundle.image, look, quality, crossings.a, crossings.b, crossings.grown_a, crossings.grown_b, error)
     foci = len(np.unique(bundle.focus))
     groups, share, membership = _groups(bundle, crossings, foci)
     claims = [tuple(sorted(set(bundle.image[list(group)].tolist()))) for group in groups]
-    look, place, of_quality = np.zeros(len(crossings)), np.zeros(len(crossings)), np.zeros(len(bundle))
+    by_look, place, of_quality = np.zeros(len(crossings)), np.zeros(len(crossings)), np.zeros(len(bundle))
     scale, freedom = np.ones(len(crossings)), np.full(len(crossings), 1e6)
     unsaid = float(np.log(len(bundle) / len(images)))  # of which focus an image is: a pair needs one of each
     prior, usual_mm = 0.5, float(np.median(crossings.sigma_mm)) if len(crossings) else np.inf
     packing, gain = Packing(np.zeros(0, bool), np.zeros(0)), np.zeros(len(groups))
     for _ in range(ROUNDS):  # what pairs look like, and how many there are, from the pairs themselves
-        gain = share @ crossings.log_ratio(usual_mm, scale, freedom) + membership @ (look + place)
+        gain = share @ crossings.log_ratio(usual_mm, scale, freedom) + membership @ (by_look + place)
         gain += np.array([of_quality[list(g)].sum() + (np.log(prior / (1 - prior)) - unsaid) * (len(g) - 1) for g in groups])
         packing = pack(claims, gain)
         prior = _fraction(groups, packing, len(images))
@@ -138,7 +192,7 @@ def pair_rays(
         alone = images_alone(looks, of_ray)
         crossings = crossings.among(neighbours, (1 - of_ray) + alone.hidden * of_ray)
         place = log_odds_of_depths(crossings.log_depth, crossings.log_chance, crossings.a, crossings.b, of_crossing)
-        look, of_quality = log_odds_of_looks(looks, of_crossing, alone, images_alone(looks.sizes, of_ray)), alone.log_quality
+        by_look, of_quality = log_odds_of_looks(looks, of_crossing, alone, images_alone(looks.sizes, of_ray)), alone.log_quality
     found = _pairing(bundle, crossings, groups, membership, packing, images, limits, slack)
     contested = _contested(claims, {claims[groups.index(g)] for g, doubt in zip(found.groups, found.ambiguous, strict=True) if doubt})
     return replace(found, contested=tuple(groups[g] for g in contested), contested_log_odds=gain[contested])
@@ -148,17 +202,6 @@ def _contested(claims: list[tuple[int, ...]], ambiguous: set[tuple[int, ...]]) -
     """Return the groups that share images with ambiguous ones, directly or by others."""
     linked = [g for part in components(claims) if any(claims[g] in ambiguous for g in part) for g in part]
     return linked if len(linked) <= MOST_CONTESTED else []
-
-
-def _looks(
-    bundle: RayBundle, crossings: Crossings, radius_mm: Float | None, contrast: Float | None, quality: Int | None, error: Float | None
-) -> Looks:
-    known = [np.full(len(bundle), np.nan) if values is None else values for values in (radius_mm, contrast)]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        of_ray = np.log(np.stack(known, axis=1))
-    quality = np.zeros(len(bundle), np.int64) if quality is None else quality
-    error = np.zeros(len(bundle)) if error is None else np.clip(np.nan_to_num(error), 0.0, UNSURE[0])
-    return Looks(bundle.image, of_ray, quality, crossings.a, crossings.b, crossings.grown_a, crossings.grown_b, error)
 
 
 def _groups(bundle: RayBundle, crossings: Crossings, foci: int) -> tuple[list[tuple[int, ...]], Float, Float]:
