@@ -198,7 +198,7 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
     pairing = _pair(table, bundle, scale, study, region, slant=slant)
     complete = name_objects(named, table, bundle, pairing, foreign)
     reconstruction = reconstruct(complete.points, cage, study.limits, TIP_ERROR)
-    findings += _pair_findings(pairing, study) + lonely_images(table, pairing, bundle) + pins_left(table, free)
+    findings += _pair_findings(pairing, study) + lonely_images(table, pairing, bundle) + pins_left(table, pairing, bundle)
     result = _judged(complete, reconstruction, findings + judge(reconstruction, _nominal(study, cage), study.limits))
     return replace(result, sightlines=left_open(result.points, complete.rows, bundle, pairing, by_cage(reconstruction, cage)))
 
@@ -224,7 +224,7 @@ def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) 
     pairing = exact if len(exact.groups) >= len(tolerant.groups) else tolerant
     nothing = table.with_points(table.points.rows(~everything), table.rows[:0])
     complete = name_objects(nothing, table, bundle, pairing, ~everything)
-    findings = _pair_findings(pairing, study) + lonely_images(table, pairing, bundle) + pins_left(table, everything)
+    findings = _pair_findings(pairing, study) + lonely_images(table, pairing, bundle) + pins_left(table, pairing, bundle)
     if not pairing.groups:
         return _failed(complete, [*findings, ("cage-not-found", "no image of one film meets one of the other: look at the calibration")])
     reconstruction = reconstruct_calibrated(complete.points, cameras, study.limits)
@@ -243,15 +243,22 @@ def _pair(
     slant: Float | None = None,
 ) -> Pairing:
     scale = np.array([mm_per_px[int(focus)] for focus in bundle.focus])
-    radius_mm, contrast = table.radius_px[bundle.image] * scale, table.contrast[bundle.image]
+    radius_mm, shape = table.radius_px[bundle.image] * scale, table.points.shape[bundle.image]
     if slant is not None:  # a ball seen at a slant is an ellipse, longer by 1 / cos: the fitted radius is the geometric mean
-        radius_mm = radius_mm * np.sqrt(slant)
-    quality = image_quality(table.points.flags[bundle.image])
-    # the edge of a disc tells its radius about as well as its centre
-    sd_px = np.sqrt(np.trace(table.points.covariance_px2, axis1=1, axis2=2) / 2)
-    error = (sd_px / table.radius_px)[bundle.image]
+        radius_mm = radius_mm * np.where(shape == "ball", np.sqrt(slant), 1.0)
+    # the edge of a disc tells its radius about as well as its centre, that of a pin its width as well as its place across
+    variance = np.linalg.eigvalsh(table.points.covariance_px2)
+    sd_px = np.sqrt(np.where(table.points.shape == "ball", variance.mean(axis=1), variance[:, 0]))
     return pair_rays(
-        bundle, study.limits, region=region, radius_mm=radius_mm, contrast=contrast, quality=quality, error=error, slack_mm=slack_mm
+        bundle,
+        study.limits,
+        region=region,
+        shape=shape,
+        radius_mm=radius_mm,
+        contrast=table.contrast[bundle.image],
+        quality=image_quality(table.points.flags[bundle.image]),
+        error=(sd_px / table.radius_px)[bundle.image],
+        slack_mm=slack_mm,
     )
 
 

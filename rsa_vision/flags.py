@@ -78,7 +78,7 @@ REASONS: Final[dict[str, str]] = {
     "pair-ambiguous": "another pairing of the object markers explains the rays nearly as well, or by later examinations better",
     "crossing-large": "rays of a marker miss each other by more than their statistics allow",
     "marker-one-view": "markers were seen from one focus only and have no coordinates",
-    "pins-unpaired": "single pins were found that are no cage marks; object markers are balls, so that pins have no coordinates",
+    "pins-unpaired": "single pins were found that are no cage marks, and none of them has a partner on the other film",
     "marker-mismatch": "the markers found are not those of segments.csv, or of the earlier examinations",
     "marker-loose": "a marker is not where the other markers of its segment say; leave it out, or look for a wrong pair",
     "constellation-ambiguous": "the markers fit segments.csv, or the earlier examinations, in more than one way or in none that is sure",

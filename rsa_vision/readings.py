@@ -21,7 +21,7 @@ from rsa_vision.verdict import Finding
 MAY_BE_MARKER: Final = 0.1  # probability from which a single image is one for a person to look at
 LOOKS_DOUBTFUL: Final = int(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SATURATED | MarkerFlag.CLIPPED | MarkerFlag.POOR_FIT)
 """Images whose size and contrast say little of their markers."""
-OBJECT_SHAPE: Final = "ball"
+OBJECT_SHAPES: Final = ("ball", "pin")
 _MOST_TOLD: Final = 3  # places of one film that a message lists
 _SOME_PINS: Final = 2  # images: a single one may be a part of something else
 
@@ -74,8 +74,11 @@ class Readings:
 
     @property
     def contrast(self) -> Float:
-        """Contrasts in the table of all images, as they would be on one background of each film."""
-        return np.concatenate([_contrasts_alike(film.images) for film in self.films])
+        """Contrasts of balls in the table of all images, as they would be on one background of each film.
+
+        NaN for other shapes: how dense a pin is goes with how the ray meets it.
+        """
+        return np.concatenate([np.where(film.images.shape == "ball", _contrasts_alike(film.images), np.nan) for film in self.films])
 
     @property
     def source(self) -> Int:
@@ -138,7 +141,7 @@ def _renamed(points: ImagePoints, names: Sequence[tuple[int, str, str]]) -> Imag
 def candidates(table: Readings, free: Bool, focus: int) -> Int:
     """Return the rows of images that may be object markers of a focus."""
     points = table.points
-    return np.flatnonzero(free & (points.shape == OBJECT_SHAPE) & np.isin(points.focus, (0, focus)))
+    return np.flatnonzero(free & np.isin(points.shape, OBJECT_SHAPES) & np.isin(points.focus, (0, focus)))
 
 
 def name_objects(named: Readings, table: Readings, bundle: RayBundle, pairing: Pairing, foreign: Bool) -> Readings:
@@ -169,7 +172,7 @@ def _contrasts_alike(images: MarkerImages) -> Float:
 
 
 def image_quality(flags: Int) -> Int:
-    """Return how well images were fitted: 0 clear, 1 disturbed by something beside them, 2 not described by the model of a ball."""
+    """Return how well images were fitted: 0 clear, 1 disturbed by something beside them, 2 not described by the model of its shape."""
     return np.where(flags & MarkerFlag.POOR_FIT, 2, np.where(flags & LOOKS_DOUBTFUL, 1, 0)).astype(np.int64)
 
 
@@ -182,23 +185,27 @@ def lonely_images(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[
     quality = image_quality(table.points.flags)
     found: list[Finding] = []
     for number, film in enumerate(table.films):
-        here = np.flatnonzero(paired & (table.points.film == number))
-        here = np.concatenate([here, pairing.unmatched[table.points.film[pairing.unmatched] == number]])
-        chance = chance_of_marker(look[here], table.points.position_px[here], quality[here], paired[here], film.shape)
-        lonely = here[(chance > MAY_BE_MARKER) & ~paired[here]]
-        if len(lonely):
-            found.append(("marker-one-view", f"{table.films[number].path.name}: {_told(table.points.position_px[lonely])}"))
+        lonely = [np.zeros(0, np.int64)]
+        for shape in OBJECT_SHAPES:
+            mine = (table.points.film == number) & (table.points.shape == shape)
+            here = np.concatenate([np.flatnonzero(paired & mine), pairing.unmatched[mine[pairing.unmatched]]])
+            known = look[here][:, : 2 if shape == "ball" else 1]
+            chance = chance_of_marker(known, table.points.position_px[here], quality[here], paired[here], film.shape)
+            lonely.append(here[(chance > MAY_BE_MARKER) & ~paired[here]])
+        if len(rows := np.concatenate(lonely)):
+            found.append(("marker-one-view", f"{film.path.name}: {_told(table.points.position_px[rows])}"))
     return found
 
 
-def pins_left(table: Readings, free: Bool) -> list[Finding]:
-    """Find clear single pins that no mark of the cage explains: object markers are balls, so that these have no coordinates."""
-    left = np.flatnonzero(free & (table.points.shape == "pin") & (table.points.flags == 0))
-    if len(left) < _SOME_PINS:
+def pins_left(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[Finding]:
+    """Find clear pins of films none of whose pins has a partner, so that nothing tells which of them are markers."""
+    points = table.points
+    left = pairing.unmatched[(points.shape[pairing.unmatched] == "pin") & (points.flags[pairing.unmatched] == 0)]
+    if len(left) < _SOME_PINS or any(points.shape[bundle.image[group[0]]] == "pin" for group in pairing.groups):
         return []
-    on = ", ".join(table.films[k].path.name for k in np.unique(table.points.film[left]))
-    told = f"{len(left)} images of single pins ({on}) have no coordinates: object markers are balls"
-    return [("pins-unpaired", f"{told}; to measure pins, name their tips in images.csv and give it to reconstruct")]
+    on = ", ".join(table.films[k].path.name for k in np.unique(points.film[left]))
+    told = f"{len(left)} images of single pins ({on}) have no partner, and so no coordinates"
+    return [("pins-unpaired", f"{told}; if they are markers, name their tips in images.csv and give it to reconstruct")]
 
 
 def _told(position_px: Float) -> str:

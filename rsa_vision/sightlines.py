@@ -16,7 +16,7 @@ from rsa_vision.flags import MarkerFlag, flag_value
 from rsa_vision.geometry.camera import Pinhole, camera_rays
 from rsa_vision.geometry.rays import RayBundle
 from rsa_vision.identify.pairs import Pairing
-from rsa_vision.readings import OBJECT_SHAPE, joined_rays
+from rsa_vision.readings import OBJECT_SHAPES, joined_rays
 from rsa_vision.types import Float, ImagePoints, Int, Reconstruction
 from rsa_vision.xray import rays_of
 
@@ -121,7 +121,7 @@ def single_images(reconstruction: Reconstruction, rays_of: RaysOf) -> Sightlines
     points = reconstruction.points
     once = reconstruction.markers.name[reconstruction.markers.n_views == 1]
     alone = (points.role == "object") & np.isin(points.number, once)
-    free = alone | ((points.role == "unassigned") & (points.shape == OBJECT_SHAPE))
+    free = alone | ((points.role == "unassigned") & np.isin(points.shape, OBJECT_SHAPES))
     pairs = [(focus.focus, row) for focus in reconstruction.foci for row in np.flatnonzero(free & np.isin(points.focus, (0, focus.focus)))]
     focus, image = np.array(pairs, np.int64).reshape(-1, 2).T
     return replace(Sightlines.none(), rays=_rays(points, focus, image, rays_of))
@@ -142,4 +142,4 @@ def is_free(image: Row) -> bool:
     flags = flag_value(image["flags"] or "")
     if image["role"] == "object":
         return bool(flags & MarkerFlag.ONE_VIEW)
-    return bool(image["role"] == "unassigned" and image["shape"] == OBJECT_SHAPE and not flags & MarkerFlag.FOREIGN_MARK)
+    return bool(image["role"] == "unassigned" and image["shape"] in OBJECT_SHAPES and not flags & MarkerFlag.FOREIGN_MARK)

@@ -17,7 +17,7 @@ import rsa_vision
 from rsa_vision.cli import run_app
 from rsa_vision.types import Float, MarkerImages
 
-SIZE, FOCAL_PX, DISTANCE_MM, SD_PX = 400, 1500.0, 900.0, 0.02
+SIZE, FOCAL_PX, DISTANCE_MM, SD_PX, ALONG_PX = 400, 1500.0, 900.0, 0.02, 0.3
 SIGMAS = 5.0  # of 27 coordinates
 TURNS_DEG = {1: 0.0, 2: 70.0}
 
@@ -38,7 +38,9 @@ def seen(points_mm: Float, turn_deg: float) -> Float:
 
 
 @pytest.fixture
-def biplane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Float]:
+def biplane(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Float]:
+    """Nine balls, or as many of them as are asked for pins that point anywhere."""
+    pins = np.arange(9) < getattr(request, "param", 0)
     rng = np.random.default_rng(11)
     points = rng.uniform(-40, 40, (9, 3))
     folder = tmp_path / "study"
@@ -48,10 +50,19 @@ def biplane(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Floa
     for focus, turn in TURNS_DEG.items():
         film = rng.integers(0, 60000, (SIZE, SIZE)).astype(np.uint16)
         tifffile.imwrite(folder / f"H_1_f{focus}.tif", film)
-        px = seen(points, turn) + rng.normal(0, SD_PX, (9, 2))
+        angle = np.where(pins, rng.uniform(-np.pi, np.pi, 9), np.nan)
+        along = ALONG_PX * np.nan_to_num(np.column_stack([np.cos(angle), -np.sin(angle)]))
+        px = seen(points, turn) + rng.normal(0, SD_PX, (9, 2)) + rng.normal(0, 1, (9, 1)) * along
         n = len(px)
-        cov = np.tile(np.eye(2) * SD_PX**2, (n, 1, 1))
-        look = (np.full(n, "ball"), np.full(n, 2.5), np.full(n, np.nan), *np.full((2, n), 0.5), np.full(n, 40.0), np.zeros(n, np.int64))
+        cov = np.eye(2) * SD_PX**2 + along[:, :, None] * along[:, None]
+        look = (
+            np.where(pins, "pin", "ball"),
+            np.full(n, 2.5),
+            np.rad2deg(angle),
+            *np.full((2, n), 0.5),
+            np.full(n, 40.0),
+            np.zeros(n, np.int64),
+        )
         known[int(film[0, 0]), int(film[0, 1])] = MarkerImages(px, cov, *look)
         (folder / f"calib_f{focus}.txt").write_text(camera_text(turn))
         lines.append(f'{focus} = "calib_f{focus}.txt"')
@@ -77,6 +88,19 @@ def test_markers_without_cage_and_without_pitch(biplane: tuple[Path, Float], tmp
     assert sd.max() < 0.05
     assert len(pl.read_csv(out / "foci.csv")) == 2
     assert "calibrated cameras" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize("biplane", [5, 6], indirect=True)
+def test_pins_are_markers_whose_errors_are_long_along_them(biplane: tuple[Path, Float], tmp_path: Path) -> None:
+    folder, truth = biplane
+    out = tmp_path / "out"
+    assert run_app(["measure", str(folder), "-o", str(out)]) == 0
+    markers = pl.read_csv(out / "markers.csv")
+    place, sd = (markers.select(*(f"{prefix}{axis}_mm" for axis in "xyz")).to_numpy() for prefix in ("", "sd_"))
+    nearest = cKDTree(truth).query(place)[1]
+    assert sorted(nearest.tolist()) == list(range(9))
+    assert np.abs((place - truth[nearest]) / sd).max() < SIGMAS
+    assert sd.max() > 0.5 * ALONG_PX * DISTANCE_MM / FOCAL_PX
 
 
 def test_films_that_are_not_of_these_cameras_fail(biplane: tuple[Path, Float], tmp_path: Path) -> None:
