@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rsa_vision.detect.balls.alike import true_spread
+from rsa_vision.detect.balls.alike import evidence_of_spread, true_spread
 
 TRIALS = 400
 
@@ -42,3 +42,23 @@ def test_few_or_two_kinds_tell_nothing() -> None:
     _, spread, belongs = true_spread(np.array([1.0, 1.3] * 8), np.full(16, 1e-4))
     assert belongs.all()
     assert spread > 0.14
+
+
+@pytest.mark.parametrize("n", [6, 14, 37])
+def test_what_is_the_same_seldom_seems_to_differ(n: int) -> None:
+    rng = np.random.default_rng(n)
+    errors = rng.uniform(0.01, 0.05, (TRIALS, n))
+    odds = np.array([evidence_of_spread(rng.normal(0.3, error), error**2, 0.4) for error in errors])
+    assert np.mean(odds > 1) < 0.03
+    assert np.mean(odds > 3) < 0.01
+
+
+def test_what_differs_by_more_than_its_errors_is_known_to() -> None:
+    rng = np.random.default_rng(0)
+    odds = [evidence_of_spread(rng.normal(0.3, np.hypot(0.06, 0.02), 14), np.full(14, 0.02**2), 0.4) for _ in range(TRIALS)]
+    assert np.mean(np.array(odds) > 1) > 0.98
+
+
+def test_evidence_has_no_unit() -> None:
+    values, errors = np.array([1.0, 1.2, 0.9, 1.6, 1.1]), np.array([0.1, 0.1, 0.2, 0.1, 0.1])
+    assert evidence_of_spread(10 * values, (10 * errors) ** 2, 10.0) == pytest.approx(evidence_of_spread(values, errors**2, 1.0))

@@ -14,6 +14,7 @@ from .test_covered import CELLS, exposed, light_past_tees, tips_of
 from .test_pins import film_of_pins
 
 COUNT = CELLS**2
+SURE = 3.0  # logarithm of odds
 
 
 def stated_errors(film: np.ndarray, tips: Float, shape: str) -> tuple[float, float, float]:
@@ -57,11 +58,11 @@ def test_only_what_is_more_than_chance_is_a_difference(spread: float) -> None:
     for seed in range(50):
         rng = np.random.default_rng(seed)
         blurs = [rng.normal(0.3, np.hypot(spread, 0.03), 1) for _ in range(16)]
-        if (found := differing(blurs, [np.full(1, 0.03**2)] * 16, MOST_BLURRIER)) is not None:
+        if (found := differing(blurs, [np.full(1, 0.03**2)] * 16, MOST_BLURRIER, SURE)) is not None:
             told += 1
             assert not spread or (0.4 * spread < np.median(found.spread) < 2 * spread and abs(found.typical - 0.3) < spread)
     assert (told < 3) if spread == 0 else (told == 50)
 
 
 def test_few_needles_tell_nothing_of_blurs() -> None:
-    assert differing([np.array([-0.3]), np.array([0.3])], [np.array([1e-4])] * 2, MOST_BLURRIER) is None
+    assert differing([np.array([-0.3]), np.array([0.3])], [np.array([1e-4])] * 2, MOST_BLURRIER, SURE) is None

@@ -11,6 +11,7 @@ _LEAST = 5  # from so many on their scatter tells something
 _OUTLIER = 3.0  # standard deviations
 SD_OF_MAD = 1.4826  # standard deviation of what is normal in units of its median deviation
 _MEDIAN_CHI2 = 0.455  # of one degree of freedom
+_HARDLY, _ORDERS = 0.2, 40  # part of an error of measurement; spreads that are tried
 _STEPS = (np.arange(200) + 0.5) / 200  # spreads over themselves and the scatter
 
 
@@ -42,12 +43,38 @@ def true_spread(values: Float, variances: Float) -> tuple[float, float, Bool]:
         return middle, np.inf, everything
     # spreads from none to endless, close to each other where they are like the scatter of the values or less
     spread = _STEPS / (1 - _STEPS) * np.sqrt(x.var() + np.median(v))
-    weight = 1 / (v + spread[:, None] ** 2)
-    centre = (weight @ x) / weight.sum(1)
-    squares = (weight * (x - centre[:, None]) ** 2).sum(1)
-    log_likelihood = 0.5 * (np.log(weight).sum(1) - np.log(weight.sum(1)) - squares)
+    centre, log_likelihood = _of_spreads(x, v, spread)
     likelihood = np.exp(log_likelihood - log_likelihood.max()) * _STEPS / (1 - _STEPS) ** 3  # times the variance from step to step
     return float(np.average(centre, weights=likelihood)), float(np.sqrt(np.average(spread**2, weights=likelihood))), belongs
+
+
+def evidence_of_spread(values: Float, variances: Float, most: float) -> float:
+    """Return the logarithm of the odds that quantities differ against that they are all the same, which are even before.
+
+    If they differ, all orders of magnitude of their spread up to ``most`` are as likely before, from that on which hardly shows.
+
+    Parameters
+    ----------
+    values, variances : ndarray of shape (n,)
+        Measured, with their variances.
+    most : float
+
+    Returns
+    -------
+    float
+    """
+    least = min(_HARDLY * float(np.sqrt(np.median(variances))), 0.5 * most)
+    _, log_likelihood = _of_spreads(values, variances, np.concatenate([[0.0], np.geomspace(least, most, _ORDERS)]))
+    same, differ = log_likelihood[0], log_likelihood[1:]
+    return float(differ.max() - same + np.log(np.mean(np.exp(differ - differ.max()))))
+
+
+def _of_spreads(values: Float, variances: Float, spread: Float) -> tuple[Float, Float]:
+    """Mean of true values and logarithm of the marginal likelihood, by their spreads (k,)."""
+    weight = 1 / (variances + spread[:, None] ** 2)
+    centre = (weight @ values) / weight.sum(1)
+    squares = (weight * (values - centre[:, None]) ** 2).sum(1)
+    return centre, 0.5 * (np.log(weight).sum(1) - np.log(weight.sum(1)) - squares)
 
 
 def robust_sd(values: Float) -> float:

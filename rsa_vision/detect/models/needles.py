@@ -17,7 +17,7 @@ from rsa_vision.detect.models.needle_tables import FINE_Q, LOG_GRID, Key, cell_o
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
 
-_BLUR_GRID = 0.002  # of the logarithm of a needle's own blur
+_OWN_GRID = 0.002  # of the logarithms of a needle's own blur and attenuation
 _UNEVEN_GRID = 0.02  # between what is uneven, of the blur of an arm, that has tables of its own
 
 
@@ -71,6 +71,8 @@ class NeedleFit:
         Largest difference from the background in its image; the depth is what full opacity would come to.
     blurrier : float
         Logarithm of its blur over that of the film: the penumbra grows with the distance from the film.
+    denser : float
+        Logarithm of its attenuation over that of the film: pins of several widths may be of several metals.
     edged : bool
         There is an edge in its background.
     """
@@ -93,6 +95,7 @@ class NeedleFit:
     slants: Float | None = None
     height: float = 0.0
     blurrier: float = 0.0
+    denser: float = 0.0
     edged: bool = False
 
     @property
@@ -101,10 +104,11 @@ class NeedleFit:
         return np.array([np.cos(self.angles[0]), -np.sin(self.angles[0])])
 
     def seen_by(self, optics: Optics) -> Optics:
-        """Return a film's optics with the blur of this needle, on a grid that has tables of its own."""
-        if abs(self.blurrier) < _BLUR_GRID / 2:
+        """Return a film's optics with the blur and the attenuation of this needle, on a grid that has tables of its own."""
+        blurrier, denser = (_OWN_GRID * round(own / _OWN_GRID) for own in (self.blurrier, self.denser))
+        if not (blurrier or denser):
             return optics
-        return replace(optics, sigma_px=optics.sigma_px * math.exp(_BLUR_GRID * round(self.blurrier / _BLUR_GRID)))
+        return replace(optics, sigma_px=optics.sigma_px * math.exp(blurrier), mu_px=optics.mu_px * math.exp(denser))
 
 
 def unexplained(fit: NeedleFit) -> float:

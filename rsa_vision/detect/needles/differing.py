@@ -1,4 +1,4 @@
-"""What each pin or tee has of its own where others may have the same: its blur, and of pins the taper.
+"""What each pin or tee has of its own where others may have the same: its blur, and of pins the taper and the attenuation.
 
 A focal spot's penumbra grows with the distance from the film, and a cage has marks in two planes; pins of several lengths have points of
 one angle. How far they differ, the needles of a film tell. Where that is no more than errors of measurement make, all have the same, which
@@ -7,24 +7,26 @@ is what sharpens tips most; where it is more, each may differ as far as those of
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from rsa_vision.detect.balls.alike import true_spread
+from rsa_vision.detect.balls.alike import evidence_of_spread, true_spread
 from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.types import Float
 
 MOST_BLURRIER = 0.8  # of the logarithm of a needle's blur over the film's
+MOST_DENSER = 1.0  # of the logarithm of a pin's attenuation over the film's
 MOST_TAPER = 0.4  # of the taper of a pin over the usual one
-_ALIKE = 1e-4  # of either, by which equal ones differ
-_BY_CHANCE, _OUTLIER = 4.0, 3.0  # standard deviations: of the mean square by which all differ; of one that is as odd as any
+_ALIKE = 1e-4  # of any of these, by which equal ones differ
+_OUTLIER = 3.0  # standard deviations of one that is as odd as any: it alone says little of the others
 _LEAST = 5  # needles that can tell
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Differing:
-    """How far the needles of a film may differ: logarithms of their blurs over the film's, or tapers.
+    """How far the needles of a film may differ: logarithms of their blurs or attenuations over the film's, or tapers.
 
     Attributes
     ----------
@@ -44,12 +46,14 @@ class Differing:
 
 
 def equal(sets: list[list[NeedleFit]]) -> Differing:
-    """Take the blurs of all needles of the windows of a film as equal, or what their tapers differ."""
+    """Take the blurs of all needles of the windows of a film as equal, or what their tapers or attenuations differ."""
     return Differing(0.0, [np.full(len(members), _ALIKE) for members in sets])
 
 
-def differing(values: list[Float], variances: list[Float], most: float) -> Differing | None:
-    """Tell how far needles differ from what fits in which all are free leave, by windows; nothing where it is what chance makes.
+def differing(values: list[Float], variances: list[Float], most: float, sure: float) -> Differing | None:
+    """Tell how far needles differ from what fits in which all are free leave, by windows.
+
+    The square of the spread is the mean over both, that they differ and that they are all the same.
 
     Parameters
     ----------
@@ -57,19 +61,21 @@ def differing(values: list[Float], variances: list[Float], most: float) -> Diffe
         Measured, and the squares of their errors.
     most : float
         How far one may differ that is as odd as any.
+    sure : float
+        Logarithm of the odds that they do, below which it is taken for chance.
 
     Returns
     -------
     Differing or None
+        None where it is chance, or more than can be.
     """
     of_all, variance = np.concatenate(values), np.concatenate(variances)
     if len(of_all) < _LEAST:
         return None
-    squares = np.minimum(np.square(of_all - np.average(of_all, weights=1 / variance)) / variance, _OUTLIER**2)
-    if squares.mean() < 1 + _BY_CHANCE * np.sqrt(2 / len(of_all)):
-        return None
     centre, spread, belongs = true_spread(of_all, variance)
-    if not spread < most:
+    middle, far = np.average(of_all, weights=1 / variance), _OUTLIER * np.sqrt(variance)
+    odds = evidence_of_spread(np.clip(of_all, middle - far, middle + far), variance, most)
+    if odds < sure or not spread < most:
         return None
-    each = np.where(belongs, spread, most)
+    each = np.where(belongs, spread / math.sqrt(1 + math.exp(-odds)), most)
     return Differing(centre, np.split(each, np.cumsum([len(of) for of in values])[:-1]))

@@ -19,8 +19,8 @@ from rsa_vision.types import Float, Int
 # common to all: attenuation, blur, taper, curve (2), tail, late, logged, uneven (2); logarithms of half width and length; directions
 BENT, UNEVEN = slice(3, 10), slice(8, 10)
 OPTICS, SHARED = 10, 12
-OWN = 5  # tip (2), half width, length, blur; then directions, slants, and how arms differ, or the taper of a pin
-BLUR, TAPER, LATE, LOGGED = 1, 2, 6, 7  # places of these in what is common
+OWN = 5  # tip (2), half width, length, blur; then directions, slants, and how arms differ, or the attenuation and the taper of a pin
+ATTENUATION, BLUR, TAPER, LATE, LOGGED = 0, 1, 2, 6, 7  # places of these in what is common
 SLANT, SKEW = 0.11, 0.08  # root mean squares, of a square and a product of slopes: rays cross a film at slopes of up to a half
 # slants and skews of the arms by what one ray does at all of them: squares of its slopes along the first arm and across, and their product
 OF_SLANTS = {
@@ -50,6 +50,10 @@ class Expected:
         What is usual.
     of_taper : ndarray of shape (members,)
         How far each pin may differ from that.
+    density : float
+        What is usual of the logarithm of a pin's attenuation over the film's.
+    of_density : ndarray of shape (members,)
+        How far each may differ from that.
     regularity : Regularity, optional
         Of the arms of tees.
     of_ways : ndarray of shape (members, 4)
@@ -62,6 +66,8 @@ class Expected:
     of_blur: Float
     taper: float
     of_taper: Float
+    density: float
+    of_density: Float
     regularity: Regularity | None
     of_ways: Float
 
@@ -165,6 +171,11 @@ class Equations:
         change, variance = self._free(np.array([own_parameters(1, self.parallel) - 1]))
         return np.array([f.shape.taper for f in self.members]) + change[:, 0], variance[:, 0]
 
+    def free_densities(self) -> tuple[Float, Float]:
+        """How far the attenuation of each pin differs were nothing expected of that, and the squares of the errors, shape (members,)."""
+        change, variance = self._free(np.array([own_parameters(1, self.parallel) - 2]))
+        return np.array([f.denser for f in self.members]) + change[:, 0], variance[:, 0]
+
     def free_sizes(self) -> tuple[Float, Float]:
         """Logarithms of half width and length of each were nothing expected of them, and the squares of the errors, shape (members, 2)."""
         change, variance = self._free(np.array([2, 3]))
@@ -246,8 +257,8 @@ def linearise(
     left = window.data - model
     now = [replace(f, depths=theta[arms * i : arms * (i + 1)].copy()) for i, f in enumerate(members)]
     moves, common, priors, known = [], np.zeros((SHARED + (arms - 1) * parallel, len(weight))), [], []
-    of_each = zip(now, blocks, slopes, expected.of_sizes, expected.of_blur, expected.of_taper, expected.of_ways, strict=True)
-    for f, block, slope, of_size, of_blur, of_taper, of_ways in of_each:
+    spreads = expected.of_sizes, expected.of_blur, expected.of_taper, expected.of_density, expected.of_ways
+    for f, block, slope, of_size, of_blur, of_taper, of_density, of_ways in zip(now, blocks, slopes, *spreads, strict=True):
         size = np.array([f.shape.half_width_px, f.shape.length_px])
         by_tip_and_size, by_common = f.depths @ block[1:5], f.depths @ slope
         turns = f.depths[:, None] * block[5]
@@ -268,9 +279,9 @@ def linearise(
             -(slants.ravel() @ of_slants) / (of_slants**2).sum(0) / of_ends,
         ]
         if arms == 1:
-            moves.append(by_common[TAPER, None])
-            priors.append(np.array([1 / of_taper]))
-            known.append(np.array([(expected.taper - f.shape.taper) / of_taper]))
+            moves.append(by_common[[ATTENUATION, TAPER]])
+            priors.append(np.array([1 / of_density, 1 / of_taper]))
+            known.append(np.array([(expected.density - f.denser) / of_density, (expected.taper - f.shape.taper) / of_taper]))
         if expected.regularity is not None:
             ways = slice(0 if parallel else 2, None)
             moves += [turns[1:]] * parallel + [OF_STRETCH.T @ (size[1] * f.depths[:, None] * block[4])]
@@ -297,8 +308,8 @@ def linearise(
 
 
 def own_parameters(arms: int, parallel: bool) -> int:
-    """Count tip, size and blur, one or all directions, what the ends have, how arms differ or tapers; the depths are linear."""
-    return OWN + (1 if parallel else arms) + int(OF_SLANTS[arms].shape[1]) + (1 if arms == 1 else WAYS if parallel else WAYS - 2)
+    """Count tip, size and blur, one or all directions, what ends have, how arms differ, or attenuation, taper; the depths are linear."""
+    return OWN + (1 if parallel else arms) + int(OF_SLANTS[arms].shape[1]) + (2 if arms == 1 else WAYS if parallel else WAYS - 2)
 
 
 def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:

@@ -39,7 +39,7 @@ _KNOWN = 0.12  # of its length, to which the tip of a pin is known even at CNR 5
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length: of what beams and film curves are besides, by the curve and the logarithm of the depth, by the others
-_OF_MODEL, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.003, 0.05, 0.03, 2.0
+_OF_MODEL, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.0015, 0.05, 0.03, 2.0
 # by how far a curve is from those of logarithms and roots, whose skewness is so much of their shift; the same by its third power as well
 _OF_CURVE, _OF_STEEP, _SKEWED = 0.03, 0.007, -0.2
 # tail below which a film may have been sharpened, by how much less it surely was, and error along a pin by that in units of the blur

@@ -20,8 +20,9 @@ from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import Window, window_of
-from rsa_vision.detect.needles.differing import MOST_BLURRIER, MOST_TAPER, Differing, differing, equal
+from rsa_vision.detect.needles.differing import MOST_BLURRIER, MOST_DENSER, MOST_TAPER, Differing, differing, equal
 from rsa_vision.detect.needles.equations import (
+    ATTENUATION,
     BENT,
     BLUR,
     OPTICS,
@@ -43,6 +44,7 @@ from rsa_vision.detect.needles.states import (
     change_of,
     moved_optics,
     of_several_lengths,
+    of_several_widths,
     of_usual_size,
     sizes_of,
 )
@@ -59,6 +61,10 @@ _SPOILT = 1.5  # times the chi2 of most pins: what leaves so much, on bone, tell
 _SIZE_ERROR = 1.0  # of those, before
 _ASKED_AFTER = 4  # steps, after which it is asked at the latest how far arms and blurs differ: what differs does not converge
 _BLURS_AFTER, _TAPERS_AFTER, _MORE_STEPS = 3, 5, 6
+_DENSITIES_AFTER = 4  # steps with tapers of their own
+# logarithms of the odds from which they differ: by chance one film of a hundred gets to that of tapers; a curve feigns blurs that differ;
+# whether pins of several widths are of several metals, all they can tell counts
+_BLURS_SURE, _TAPERS_SURE, _DENSITIES_SURE = 3.0, 1.0, -np.inf
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
@@ -185,7 +191,7 @@ def _begin(
     n_free = len(precision) - len(of_scanner) * (not scanned)
     sizes = Sizes(np.zeros(2), [np.full((len(m), 2), np.inf) for m in sets])
     arms = regular(sets) if len(needles[0].angles) == ARMS else None
-    at = State(sets, np.zeros(len(precision)), taper, sizes, equal(sets), equal(sets), arms)
+    at = State(sets, np.zeros(len(precision)), taper, sizes, equal(sets), equal(sets), equal(sets), arms)
     telling = _telling(sets, noise) if alike else [True] * len(sets)
     typical = float(np.median([f.explained for f in needles]))
     return _Task(belong, windows, at, optics, precision, n_free, gain, telling, typical, parallel, alike)
@@ -208,13 +214,14 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
     windows, at, start, parallel, alike, telling = task.windows, task.at, task.start, task.parallel, task.alike, task.telling
     precision, sizes, close = task.precision.copy(), at.sizes, _CONVERGED[len(at.sets[0][0].angles)] ** 2
     held = precision * task.gain
-    asked, asked_of_blurs, asked_of_tapers, sizes_at = False, False, not alike, _SIZES_AFTER
+    asked, asked_of_blurs, asked_of_tapers, asked_of_densities = False, False, not alike, not alike
+    sizes_at, densities_at = _SIZES_AFTER, 0
     slopes, since, of_each = list[list[Float]](), np.full(OPTICS, np.inf), at
     last: list[Equations | None] = [None] * len(windows)
     before: tuple[State, list[Equations], Step] | None = None
     converged, restarted, shorter, least = False, False, 0, np.inf
     through: Filter | None = None
-    for count in range(steps + 3 * _MORE_STEPS + 1):
+    for count in range(steps + 4 * _MORE_STEPS + 1):
         optics = moved_optics(start, at.moved)
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or _far_apart(at, of_each):
             slopes = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)]
@@ -250,7 +257,10 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
             ask_of_blurs = (converged or count >= _BLURS_AFTER) and not asked_of_blurs
             ask_of_tapers = (converged or count >= _TAPERS_AFTER) and count >= sizes_at and not asked_of_tapers
             ask = (converged or count >= _ASKED_AFTER) and not asked  # near enough to tell how far their arms differ
-            if ask_of_blurs or ask_of_tapers or ask:  # what needles differ by, and not what noise and bone under them make of that
+            with_tapers = (asked_of_tapers or ask_of_tapers) if converged else (asked_of_tapers and count >= densities_at)
+            ask_of_densities = with_tapers and not asked_of_densities
+            # what needles differ by, and not what noise and bone under them make of that
+            if ask_of_blurs or ask_of_tapers or ask_of_densities or ask:
                 through = through or quietest(film, windows, systems, noise)
                 quiet = _filtered(windows, systems, through)
             if ask_of_blurs:
@@ -263,9 +273,15 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
                     steps, sizes_at = steps + _MORE_STEPS, count + 1 + _SIZES_AFTER
                     continue
             if ask_of_tapers:
-                asked_of_tapers = True
+                asked_of_tapers, densities_at = True, count + _DENSITIES_AFTER
                 if of_several_lengths(at.sizes) and (pointed := _tapers(quiet, at)):
                     at, converged, least, before = replace(at, sets=pointed[0], tapers=pointed[1]), False, np.inf, None
+                    steps += _MORE_STEPS
+                    continue
+            if ask_of_densities:
+                asked_of_densities = True
+                if of_several_widths(at.sizes) and (dense := _densities(quiet)):
+                    at, converged, least, before = replace(at, sets=dense[0], densities=dense[1]), False, np.inf, None
                     steps += _MORE_STEPS
                     continue
             if ask:
@@ -309,13 +325,14 @@ def _odd(systems: list[Equations], at: State) -> Regularity | None:
 def _far_apart(at: State, before: State) -> bool:
     """Say whether some needles have changed so much of their own that derivatives by what is common are taken anew."""
     blurrier, tapers = np.abs(at.own_blurs - before.own_blurs), np.abs(at.own_tapers - before.own_tapers)
-    return bool(blurrier.max() > _MUCH[BLUR] or tapers.max() > _MUCH[TAPER])
+    denser = np.abs(at.own_densities - before.own_densities)
+    return bool(blurrier.max() > _MUCH[BLUR] or tapers.max() > _MUCH[TAPER] or denser.max() > _MUCH[ATTENUATION])
 
 
 def _blurs(systems: list[Equations]) -> tuple[list[list[NeedleFit]], Differing] | None:
     """Needles with blurs of their own, and how far these differ, where they do."""
     blurs, variances = zip(*(e.free_blurs() for e in systems), strict=True)
-    told = differing(list(blurs), list(variances), MOST_BLURRIER)
+    told = differing(list(blurs), list(variances), MOST_BLURRIER, _BLURS_SURE)
     if told is None:
         return None
     sets = [
@@ -328,7 +345,7 @@ def _blurs(systems: list[Equations]) -> tuple[list[list[NeedleFit]], Differing] 
 def _tapers(systems: list[Equations], at: State) -> tuple[list[list[NeedleFit]], Differing] | None:
     """Pins with tapers of their own, and how far these differ, where they do."""
     tapers, variances = zip(*(e.free_tapers() for e in systems), strict=True)
-    told = differing(list(tapers), list(variances), MOST_TAPER)
+    told = differing(list(tapers), list(variances), MOST_TAPER, _TAPERS_SURE)
     if told is None:
         return None
     sets = [
@@ -336,6 +353,19 @@ def _tapers(systems: list[Equations], at: State) -> tuple[list[list[NeedleFit]],
         for e, of in zip(systems, tapers, strict=True)
     ]
     return sets, replace(told, typical=told.typical - at.taper)
+
+
+def _densities(systems: list[Equations]) -> tuple[list[list[NeedleFit]], Differing] | None:
+    """Pins with attenuations of their own, and how far these differ, where they do."""
+    densities, variances = zip(*(e.free_densities() for e in systems), strict=True)
+    told = differing(list(densities), list(variances), MOST_DENSER, _DENSITIES_SURE)
+    if told is None:
+        return None
+    sets = [
+        [replace(f, denser=between(d, -MOST_DENSER, MOST_DENSER)) for f, d in zip(e.members, of, strict=True)]
+        for e, of in zip(systems, densities, strict=True)
+    ]
+    return sets, told
 
 
 def _is_uneven(precision: Float, told: Float, target: Float, moved: Float, gain: float) -> bool:

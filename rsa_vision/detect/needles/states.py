@@ -10,7 +10,7 @@ import numpy as np
 from rsa_vision.detect.balls.alike import true_spread
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
-from rsa_vision.detect.needles.differing import MOST_BLURRIER, Differing
+from rsa_vision.detect.needles.differing import MOST_BLURRIER, MOST_DENSER, Differing
 from rsa_vision.detect.needles.equations import (
     LATE,
     LOGGED,
@@ -35,7 +35,7 @@ _MOST = 3.0, 0.8, 0.6  # curve and tail
 _MOST_LATE, _MOST_LOGGED = 0.6, 3.0
 _MOST_UNEVEN = 0.8
 _MOST_BY_STEP, _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP = 0.6, 0.2, 2.0
-_BLURRIER_BY_STEP = 0.2  # by a step, of one needle's
+_BLURRIER_BY_STEP, _DENSER_BY_STEP = 0.2, 0.3  # by a step, of one needle's
 _MOST_SLANT, _MOST_SKEW = 0.6, 0.3
 
 
@@ -91,6 +91,7 @@ class State:
     blurs : Differing
     tapers : Differing
         What is typical of the differences from the common one.
+    densities : Differing
     regularity : Regularity, optional
         Of the arms of tees.
     """
@@ -101,6 +102,7 @@ class State:
     sizes: Sizes
     blurs: Differing
     tapers: Differing
+    densities: Differing
     regularity: Regularity | None
 
     @property
@@ -114,12 +116,20 @@ class State:
         return np.array([f.shape.taper for members in self.sets for f in members])
 
     @property
+    def own_densities(self) -> Float:
+        """Logarithms of the attenuations of all needles over the film's."""
+        return np.array([f.denser for members in self.sets for f in members])
+
+    @property
     def expected(self) -> list[Expected]:
         """What is expected of the needles, by sets."""
         ways = [np.zeros((len(m), WAYS)) for m in self.sets] if self.regularity is None else self.regularity.spread
-        each = zip(self.sizes.spread, self.blurs.spread, self.tapers.spread, ways, strict=True)
-        size, blur, taper = self.sizes.typical, self.blurs.typical, self.taper + self.tapers.typical
-        return [Expected(size, of_size, blur, of_blur, taper, of_taper, self.regularity, way) for of_size, of_blur, of_taper, way in each]
+        each = zip(self.sizes.spread, self.blurs.spread, self.tapers.spread, self.densities.spread, ways, strict=True)
+        size, blur, taper, density = self.sizes.typical, self.blurs.typical, self.taper + self.tapers.typical, self.densities.typical
+        return [
+            Expected(size, of_size, blur, of_blur, taper, of_taper, density, of_density, self.regularity, way)
+            for of_size, of_blur, of_taper, of_density, way in each
+        ]
 
     def after(self, step: Step, systems: list[Equations], parallel: bool) -> State:
         """Return where a step leads from where these equations hold."""
@@ -130,7 +140,7 @@ class State:
         known = self.regularity
         if known is not None and parallel:
             known = replace(known, common=known.common + step.change[SHARED:])
-        return State(sets, self.moved + step.change, taper, sizes, self.blurs, self.tapers, known)
+        return State(sets, self.moved + step.change, taper, sizes, self.blurs, self.tapers, self.densities, known)
 
 
 def sizes_of(systems: list[Equations]) -> Sizes:
@@ -141,9 +151,14 @@ def sizes_of(systems: list[Equations]) -> Sizes:
     return Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(e.members) for e in systems])[:-1]))
 
 
+def of_several_widths(sizes: Sizes) -> bool:
+    """Say whether some needles differ in width, so that they may be of several metals as well."""
+    return bool((np.concatenate(sizes.spread)[:, 0] > _SEVERAL).any())
+
+
 def of_several_lengths(sizes: Sizes) -> bool:
-    """Say whether needles differ in length by more than a slant makes, which leaves their tapers as they are."""
-    return bool(np.median(np.concatenate(sizes.spread)[:, 1]) > _SEVERAL)
+    """Say whether some needles differ in length by more than a slant makes, which leaves their tapers as they are."""
+    return bool((np.concatenate(sizes.spread)[:, 1] > _SEVERAL).any())
 
 
 def of_usual_size(sets: list[list[NeedleFit]]) -> list[list[NeedleFit]]:
@@ -217,7 +232,9 @@ def _moved(members: Sequence[NeedleFit], delta: Float, change: Float, taper: flo
         slants = (np.zeros((2, arms)) if f.slants is None else f.slants) + (OF_SLANTS[arms] @ part[OWN + turning : ends]).reshape(2, arms)
         slants = np.clip(slants, [[-SLANT], [-_MOST_SKEW]], [[_MOST_SLANT], [_MOST_SKEW]])
         blurrier = between(f.blurrier + part[OWN - 1], -MOST_BLURRIER, MOST_BLURRIER)
-        out.append(replace(f, position_px=f.position_px + part[:2], shape=shape, angles=angles, slants=slants, blurrier=blurrier))
+        denser = between(f.denser + between(part[-2], -_DENSER_BY_STEP, _DENSER_BY_STEP), -MOST_DENSER, MOST_DENSER) if arms == 1 else 0.0
+        at = f.position_px + part[:2]
+        out.append(replace(f, position_px=at, shape=shape, angles=angles, slants=slants, blurrier=blurrier, denser=denser))
     return out
 
 
