@@ -18,10 +18,11 @@ from rsa_vision.types import Float
 
 MOST_BLURRIER = 0.8  # of the logarithm of a needle's blur over the film's
 MOST_DENSER = 1.0  # of the logarithm of a pin's attenuation over the film's
+SLANTED = 0.3  # spread of that among pins that point anywhere: a ray at 45 degrees goes 1.4 times as far through them
 MOST_TAPER = 0.4  # of the taper of a pin over the usual one
 _ALIKE = 1e-4  # of any of these, by which equal ones differ
 _OUTLIER = 3.0  # standard deviations of one that is as odd as any: it alone says little of the others
-_LEAST = 5  # needles that can tell
+LEAST_TELLING = 5  # needles
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +51,11 @@ def equal(sets: list[list[NeedleFit]]) -> Differing:
     return Differing(0.0, [np.full(len(members), _ALIKE) for members in sets])
 
 
+def unknown(values: list[Float], spread: float) -> Differing:
+    """Take it that needles differ by so much, of which too few tell anything."""
+    return Differing(0.0, [np.full(len(of), spread) for of in values])
+
+
 def differing(values: list[Float], variances: list[Float], most: float, sure: float) -> Differing | None:
     """Tell how far needles differ from what fits in which all are free leave, by windows.
 
@@ -70,7 +76,7 @@ def differing(values: list[Float], variances: list[Float], most: float, sure: fl
         None where it is chance, or more than can be.
     """
     of_all, variance = np.concatenate(values), np.concatenate(variances)
-    if len(of_all) < _LEAST:
+    if len(of_all) < LEAST_TELLING:
         return None
     centre, spread, belongs = true_spread(of_all, variance)
     middle, far = np.average(of_all, weights=1 / variance), _OUTLIER * np.sqrt(variance)

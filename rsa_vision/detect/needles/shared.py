@@ -20,7 +20,17 @@ from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import Window, window_of
-from rsa_vision.detect.needles.differing import MOST_BLURRIER, MOST_DENSER, MOST_TAPER, Differing, differing, equal
+from rsa_vision.detect.needles.differing import (
+    LEAST_TELLING,
+    MOST_BLURRIER,
+    MOST_DENSER,
+    MOST_TAPER,
+    SLANTED,
+    Differing,
+    differing,
+    equal,
+    unknown,
+)
 from rsa_vision.detect.needles.equations import (
     ATTENUATION,
     BENT,
@@ -44,7 +54,7 @@ from rsa_vision.detect.needles.states import (
     change_of,
     moved_optics,
     of_several_lengths,
-    of_several_widths,
+    of_several_sizes,
     of_usual_size,
     sizes_of,
 )
@@ -280,7 +290,7 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
                     continue
             if ask_of_densities:
                 asked_of_densities = True
-                if of_several_widths(at.sizes) and (dense := _densities(quiet)):
+                if of_several_sizes(at.sizes) and (dense := _densities(quiet)):
                     at, converged, least, before = replace(at, sets=dense[0], densities=dense[1]), False, np.inf, None
                     steps += _MORE_STEPS
                     continue
@@ -358,7 +368,8 @@ def _tapers(systems: list[Equations], at: State) -> tuple[list[list[NeedleFit]],
 def _densities(systems: list[Equations]) -> tuple[list[list[NeedleFit]], Differing] | None:
     """Pins with attenuations of their own, and how far these differ, where they do."""
     densities, variances = zip(*(e.free_densities() for e in systems), strict=True)
-    told = differing(list(densities), list(variances), MOST_DENSER, _DENSITIES_SURE)
+    few = sum(map(len, densities)) < LEAST_TELLING
+    told = unknown(list(densities), SLANTED) if few else differing(list(densities), list(variances), MOST_DENSER, _DENSITIES_SURE)
     if told is None:
         return None
     sets = [

@@ -151,9 +151,9 @@ def sizes_of(systems: list[Equations]) -> Sizes:
     return Sizes(np.array([centre for centre, _, _ in told]), np.split(spread, np.cumsum([len(e.members) for e in systems])[:-1]))
 
 
-def of_several_widths(sizes: Sizes) -> bool:
-    """Say whether some needles differ in width, so that they may be of several metals as well."""
-    return bool((np.concatenate(sizes.spread)[:, 0] > _SEVERAL).any())
+def of_several_sizes(sizes: Sizes) -> bool:
+    """Say whether some needles differ in size: rays go a longer way through those at a slant, others may be of another metal."""
+    return bool((np.concatenate(sizes.spread) > _SEVERAL).any())
 
 
 def of_several_lengths(sizes: Sizes) -> bool:
