@@ -141,9 +141,10 @@ def _find_needles(
     perhaps = [*tees, *doubtful] if len(tees) >= LEAST_KNOWN else tees  # whose arms are no pins
     more_pins = look_for_pins(film, all_strokes[~on_arms(all_strokes[:, :2], perhaps)], noise)
     rough_pins = [p for p in rough_pins + more_pins if np.sign(p.depth) == sign]
-    places = _likeliest_first(faint)
+    places, clear = _likeliest_first(faint), round_ones.rows(round_ones.explained > CLOSE)
+    free = ~(on_arms(places, perhaps) | are_within(places, clear.position_px, clear.radius_px))
     lines = _long_places(mine, round_ones)
-    pins, pin_optics = find_pins(film, rough_pins, places[~on_arms(places, perhaps)], lines, perhaps, sign, optics, noise)
+    pins, pin_optics = find_pins(film, rough_pins, places[free], lines, perhaps, sign, optics, noise)
     tees, pins = [_seen(tees, noise), _seen([p for p in pins if is_located(p)], noise)]
     painted = _painted(tees, pins, tee_optics, pin_optics)
     return _Needles(tees, pins, doubtful, tee_optics, pin_optics, off_pins(seen.looks, more_pins), painted)

@@ -152,7 +152,7 @@ def ball_table(sigma_px: float, mu_px: float) -> BallTable:
     return _table(round(mu_px * sigma_px, 3))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=12)  # a fit asks for seven
 def _table(mu_sigma: float) -> BallTable:
     """Build a table; much attenuation along one blur width makes a disc, little half an ellipse."""
     blur = _blur()

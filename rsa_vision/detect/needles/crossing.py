@@ -89,7 +89,7 @@ class Window:
         """Return the covariance of linear functions (p, n) of the film's noise at the pixels."""
         return influence_covariance(self.boxes(influence), noise.correlation)
 
-    def boxes(self, values: Float) -> NDArray[np.float32]:
+    def boxes(self, values: Float | NDArray[np.float32]) -> NDArray[np.float32]:
         """Return values at the pixels (p, n) as images of the box around them, zero elsewhere."""
         out = np.zeros((len(values), self.box[0] * self.box[1]), np.float32)  # no needle's table is finer than that
         out[:, self.place] = values

@@ -50,7 +50,7 @@ def louder(window: Window, e: Equations, own: Float, common: Float, sigma_px: fl
     return ratio if ratio > 1 + _SURE * np.sqrt(4 * np.pi * sigma_px**2 * kept / expected) else 1.0
 
 
-def _band(window: Window, values: Float, sigma_px: float) -> Float:
+def _band(window: Window, values: Float | NDArray[np.float32], sigma_px: float) -> Float:
     """Leave the frequencies of images of values at the pixels of a window, shape (p, n)."""
     fine, coarse = (_smooth(window, values, sigma) for sigma in (sigma_px, _WIDE * sigma_px))
     return np.asarray(fine - coarse, np.float64)
@@ -71,7 +71,7 @@ def _of_noise(window: Window, count: int, sigma_px: float) -> tuple[float, float
     return float(kept), float(expected)
 
 
-def _smooth(window: Window, values: Float, sigma_px: float) -> NDArray[np.float32]:
+def _smooth(window: Window, values: Float | NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
     """Blur values at the pixels of a window, shape (p, n)."""
     boxes = [cv2.GaussianBlur(box, (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT) for box in window.boxes(values)]
     return np.asarray(boxes).reshape(len(boxes), -1).take(window.place, axis=1)

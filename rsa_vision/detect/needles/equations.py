@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsa_vision.detect.film.least_squares import damped_solution
 from rsa_vision.detect.film.noise import NoiseModel
@@ -72,28 +73,42 @@ class Expected:
     of_ways: Float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """What a window has shown of its needles: all that another step asks of the one before."""
+
+    members: list[NeedleFit]
+    model: Float
+    ground: Float
+    background: float
+
+
 @dataclass(frozen=True, eq=False)
 class Equations:
     """Linearised fit of the needles of a window, by needles' own parameters and by the common ones.
 
     ``own`` (p, n), ``common`` (c, n) and ``residual`` (n,) are weighted to a variance of one; ``normal`` (p + c, p + c) holds the products
-    of the former two. ``prior`` (p,) is one over what an own parameter is expected to be, ``known`` (p,) how much of that it is off.
+    of the former two, ``right`` (p + c,) those with the residual. The former two are kept as fine as their tables are. ``prior`` (p,) is
+    one over what an own parameter is expected to be, ``known`` (p,) how much of that it is off.
     """
 
-    members: list[NeedleFit]
+    shown: Shown
     images: list[Float]
     weight: Float
     left: Float
-    model: Float
-    ground: Float
-    background: float
-    own: Float
-    common: Float
+    own: NDArray[np.float32]
+    common: NDArray[np.float32]
     normal: Float
+    right: Float
     residual: Float
     prior: Float
     known: Float
     parallel: bool
+
+    @property
+    def members(self) -> list[NeedleFit]:
+        """Needles, where the equations hold."""
+        return self.shown.members
 
     @cached_property
     def inverse(self) -> Float:
@@ -111,12 +126,12 @@ class Equations:
     @cached_property
     def own_alone(self) -> Float:
         """Change of the own parameters, shape (p,), were the common ones right."""
-        return np.asarray(self.inverse @ (self.own @ self.residual + self.prior * self.known), np.float64)
+        return np.asarray(self.inverse @ (self.right[: len(self.own)] + self.prior * self.known), np.float64)
 
     def information(self) -> tuple[Float, Float]:
         """Normal matrix (c, c) and right-hand side (c,) of the common parameters, the own ones eliminated, their priors counted."""
         by_own, alone = self.normal[len(self.own) :, : len(self.own)], self.normal[len(self.own) :, len(self.own) :]
-        matrix, target = alone - by_own @ self.own_by_common, self.common @ self.residual - by_own @ self.own_alone
+        matrix, target = alone - by_own @ self.own_by_common, self.right[len(self.own) :] - by_own @ self.own_alone
         return matrix / self.excess, target / self.excess
 
     def step(self, change: Float) -> Float:
@@ -126,8 +141,10 @@ class Equations:
     def filtered(self, window: Window, through: Filter) -> Equations:
         """Return the same by generalised least squares."""
         white = window.filtered(np.concatenate([self.own, self.common, self.residual[None]]), through)
-        own, common, residual = white[: len(self.own)], white[len(self.own) : -1], white[-1]
-        return replace(self, own=own, common=common, residual=residual, normal=white[:-1] @ white[:-1].T)
+        residual = white[-1].copy()
+        kept = white[:-1].astype(np.float32)
+        own, common = kept[: len(self.own)], kept[len(self.own) :]
+        return replace(self, own=own, common=common, normal=white[:-1] @ white[:-1].T, right=white[:-1] @ residual, residual=residual)
 
     def noise_under(self, own: Float, common: Float) -> float:
         """Mean square of what is left under the needles once these changes are made over that beside them, each over what a fit leaves.
@@ -208,12 +225,12 @@ class Equations:
 def linearise(
     window: Window,
     members: list[NeedleFit],
-    slopes: list[Float],
+    slopes: list[NDArray[np.float32]],
     optics: Optics,
     noise: NoiseModel,
     parallel: bool,
     expected: Expected,
-    before: Equations | None,
+    before: Shown | None,
 ) -> Equations:
     """Linearise the fit of the needles of a window where they are.
 
@@ -228,8 +245,8 @@ def linearise(
     parallel : bool
         The arms of all needles have the same directions against their first.
     expected : Expected
-    before : Equations, optional
-        Those of the step before: noise and gain go with their background and depths.
+    before : Shown, optional
+        At the step before: noise and gain go with their background and depths.
 
     Returns
     -------
@@ -241,7 +258,7 @@ def linearise(
     if optics.proportion and before is not None:
         gains = [gain_at(f, before.ground, optics) for f in members]
         blocks = [b * g for b, g in zip(blocks, gains, strict=True)]
-        slopes = [s * g for s, g in zip(slopes, gains, strict=True)]
+        slopes = [(s * g).astype(np.float32) for s, g in zip(slopes, gains, strict=True)]
     arms = len(members[0].angles)
     of_slants = OF_SLANTS[arms]
     of_ends = np.array([*[SLANT] * (of_slants.shape[1] - 1), SKEW])
@@ -288,19 +305,18 @@ def linearise(
             priors.append(1 / of_ways[ways])
             known.append((expected.regularity.typical - ways_of(f, expected.regularity.common))[ways] / of_ways[ways])
     rows = np.concatenate([*moves, linear, common]) * root
+    kept, residual = rows.astype(np.float32), left * root
     p, rest = len(rows) - len(common), np.zeros(len(linear))
     return Equations(
-        members=now,
+        shown=Shown(now, model, theta[1 - len(surface) :] @ surface[1:], float(theta[-len(surface)])),
         images=[f.depths @ b[0] for f, b in zip(now, blocks, strict=True)],
         weight=weight,
         left=left,
-        model=model,
-        ground=theta[1 - len(surface) :] @ surface[1:],
-        background=float(theta[-len(surface)]),
-        own=rows[:p],
-        common=rows[p:],
+        own=kept[:p],
+        common=kept[p:],
         normal=rows @ rows.T,
-        residual=left * root,
+        right=rows @ residual,
+        residual=residual,
         prior=np.concatenate([*priors, rest]),
         known=np.concatenate([*known, rest]),
         parallel=parallel,
@@ -319,7 +335,7 @@ def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
     )
 
 
-def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[Float]:
-    """Derivatives of each member's arms by what is common, shape (10, k, n), as of :func:`arms_by_optics`."""
+def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[NDArray[np.float32]]:
+    """Derivatives of each member's arms by what is common, shape (10, k, n), as of :func:`arms_by_optics`; as fine as its tables."""
     offsets = [(window.cols - f.position_px[0], window.rows - f.position_px[1]) for f in members]
-    return [arms_by_optics(*at, f.angles, f.shape, f.seen_by(optics)) for at, f in zip(offsets, members, strict=True)]
+    return [arms_by_optics(*at, f.angles, f.shape, f.seen_by(optics)).astype(np.float32) for at, f in zip(offsets, members, strict=True)]

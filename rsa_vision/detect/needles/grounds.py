@@ -80,7 +80,7 @@ def errors_by_ground(
         moved = np.einsum("kma,mba->kmb", moved.reshape(len(values), len(e.members), 2), axes[mine])
         own = scatter.reshape(len(e.members), 2, len(e.members), 2)[np.arange(len(e.members)), :, np.arange(len(e.members))]
         variance = np.einsum("mba,mac,mbc->mb", axes[mine], own, axes[mine])
-        louder = noise.variance_at(level) / noise.variance_at(np.array(e.background))
+        louder = noise.variance_at(level) / noise.variance_at(np.array(e.shown.background))
         figures.append((moved**2 / (louder[:, :, None] * variance) / _MEDIAN).reshape(-1, 2))
         cell = np.repeat((centre // span).astype(np.intp), len(e.members), axis=0)
         near = np.tile(np.arange(len(e.members)), len(values))

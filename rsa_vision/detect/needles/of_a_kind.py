@@ -65,11 +65,12 @@ def others_like(film: NDArray[Any], known: list[NeedleFit], places: Float, optic
     if typical is None:
         return []
     out: list[NeedleFit] = []
-    in_vain = 0
+    tried, in_vain = np.zeros((0, 2)), 0
     for start in laid_over(film, places[~on_arms(places, known)], [typical], optics):
-        if on_arms(start.place[None], out).any():
-            continue
-        in_vain += 1
+        tip = start.pin.position_px
+        if on_arms(start.place[None], out).any() or (np.hypot(*(tried - tip).T) < typical.shape.half_width_px).any():
+            continue  # from so near a fit ends at the same pin
+        tried, in_vain = np.append(tried, tip[None], axis=0), in_vain + 1
         if in_vain > _MOST_IN_VAIN:
             break
         found = _fit_like(film, start.pin, optics, noise)

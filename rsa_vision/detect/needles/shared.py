@@ -39,6 +39,7 @@ from rsa_vision.detect.needles.equations import (
     TAPER,
     UNEVEN,
     Equations,
+    Shown,
     by_optics,
     linearise,
 )
@@ -141,7 +142,7 @@ def fit_shared(
     normal = precision + sum(matrix for matrix, _ in told)
     change = change_of(normal, sum(target for _, target in told) - precision @ at.moved, at, task.start)
     step = Step(change, [e.step(change) for e in systems])
-    at = at.after(step, systems, task.parallel)
+    at = at.after(step, [e.shown for e in systems], task.parallel)
     optics = moved_optics(task.start, at.moved)
     rest = AtRest(task.windows, systems, at.sets, step, task.telling, normal, precision, optics, through, converged)
     place = np.argsort([i for index in task.belong for i in index])
@@ -226,9 +227,9 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
     held = precision * task.gain
     asked, asked_of_blurs, asked_of_tapers, asked_of_densities = False, False, not alike, not alike
     sizes_at, densities_at = _SIZES_AFTER, 0
-    slopes, since, of_each = list[list[Float]](), np.full(OPTICS, np.inf), at
-    last: list[Equations | None] = [None] * len(windows)
-    before: tuple[State, list[Equations], Step] | None = None
+    slopes, since, of_each = list[list[NDArray[np.float32]]](), np.full(OPTICS, np.inf), at
+    last: list[Shown | None] = [None] * len(windows)
+    before: tuple[State, list[Shown], Step] | None = None
     converged, restarted, shorter, least = False, False, 0, np.inf
     through: Filter | None = None
     for count in range(steps + 4 * _MORE_STEPS + 1):
@@ -236,14 +237,15 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or _far_apart(at, of_each):
             slopes = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)]
             since, of_each = at.moved[:OPTICS], at
+        systems, quiet = list[Equations](), list[Equations]()  # those before take much memory
         systems = [
             linearise(w, m, k, optics, noise, parallel, expected, e)
             for w, m, k, expected, e in zip(windows, at.sets, slopes, at.expected, last, strict=True)
         ]
         cost = sum(e.cost for e in systems) + float(at.moved @ held @ at.moved)
         if before and cost > least + task.n_free and shorter < _SHORTER and count < steps:
-            at, systems, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
-            step, shorter, converged = step.shorter(), shorter + 1, False
+            at, seen, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
+            step, shorter, converged, sizes_at = step.shorter(), shorter + 1, False, sizes_at + (count + 1 == sizes_at)
         else:
             told = [e.information() for e in compress(systems, telling)]
             normal = held + sum(matrix for matrix, _ in told)
@@ -255,7 +257,7 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
                 continue
             if count == steps or converged:
                 break
-            least, shorter = cost, 0
+            least, shorter, seen = cost, 0, [e.shown for e in systems]
             change = change_of(normal, target - held @ at.moved, at, start)
             if np.abs(change[:OPTICS]).max() > 0 and (np.abs(change) < _SETTLED / np.sqrt(normal.diagonal())).all():
                 change[:OPTICS] = 0.0  # new tables for so little are not worth their time
@@ -305,8 +307,8 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
                     continue
             if converged and not alike:
                 break  # from so near the last step gets there as well; that to the sizes of all is longer
-        before, last = (at, systems, step), [*systems]
-        at = at.after(step, systems, parallel)
+        before, last = (at, seen, step), [*seen]
+        at = at.after(step, seen, parallel)
         if alike and count + 1 == sizes_at:
             through = through or quietest(film, windows, systems, noise)
             at, converged, least = replace(at, sizes=sizes_of(_filtered(windows, systems, through))), False, np.inf

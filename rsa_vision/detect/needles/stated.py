@@ -152,12 +152,12 @@ def _finished(
     covariance = by_noise[tips, tips] + by_common @ errors @ by_common.T
     of_prior = e.inverse[e.tips] * e.prior  # what is held near to the expected is not exactly there
     covariance = covariance + of_prior @ of_prior.T
-    variance = float(noise.variance_at(np.array([e.background]))[0])
+    variance = float(noise.variance_at(np.array([e.shown.background]))[0])
     out = []
     for i, (fit, image) in enumerate(zip(members, e.images, strict=True)):
         at = slice(2 * i, 2 * i + 2)
         fit = replace(fit, covariance_px2=covariance[at, at], converged=converged)
-        out.append(scored(fit, image, e.left, e.weight, window.surface, e.background, variance, window.hidden, optics))
+        out.append(scored(fit, image, e.left, e.weight, window.surface, e.shown.background, variance, window.hidden, optics))
     return out
 
 

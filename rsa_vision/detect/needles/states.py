@@ -23,6 +23,7 @@ from rsa_vision.detect.needles.equations import (
     UNEVEN,
     Equations,
     Expected,
+    Shown,
     own_parameters,
 )
 from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, between
@@ -131,11 +132,11 @@ class State:
             for of_size, of_blur, of_taper, of_density, way in each
         ]
 
-    def after(self, step: Step, systems: list[Equations], parallel: bool) -> State:
-        """Return where a step leads from where these equations hold."""
+    def after(self, step: Step, seen: list[Shown], parallel: bool) -> State:
+        """Return where a step leads from there."""
         taper = self.taper + float(step.change[TAPER])
         all_alike = taper if self.tapers.nothing else None
-        sets = [_moved(e.members, own, step.change, all_alike, parallel) for e, own in zip(systems, step.own, strict=True)]
+        sets = [_moved(e.members, own, step.change, all_alike, parallel) for e, own in zip(seen, step.own, strict=True)]
         sizes = replace(self.sizes, typical=self.sizes.typical + step.change[OPTICS:SHARED])
         known = self.regularity
         if known is not None and parallel:
