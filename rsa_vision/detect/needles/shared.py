@@ -232,20 +232,22 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
     before: tuple[State, list[Shown], Step] | None = None
     converged, restarted, shorter, least = False, False, 0, np.inf
     through: Filter | None = None
+
+    def linearised(at: State) -> list[Equations]:
+        optics, each = moved_optics(start, at.moved), zip(windows, at.sets, slopes, at.expected, last, strict=True)
+        return [linearise(w, m, k, optics, noise, parallel, expected, e) for w, m, k, expected, e in each]
+
     for count in range(steps + 4 * _MORE_STEPS + 1):
-        optics = moved_optics(start, at.moved)
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or _far_apart(at, of_each):
-            slopes = [by_optics(w, m, optics) for w, m in zip(windows, at.sets, strict=True)]
+            slopes = [by_optics(w, m, moved_optics(start, at.moved)) for w, m in zip(windows, at.sets, strict=True)]
             since, of_each = at.moved[:OPTICS], at
         systems, quiet = list[Equations](), list[Equations]()  # those before take much memory
-        systems = [
-            linearise(w, m, k, optics, noise, parallel, expected, e)
-            for w, m, k, expected, e in zip(windows, at.sets, slopes, at.expected, last, strict=True)
-        ]
+        systems = linearised(at)
         cost = sum(e.cost for e in systems) + float(at.moved @ held @ at.moved)
         if before and cost > least + task.n_free and shorter < _SHORTER and count < steps:
             at, seen, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
-            step, shorter, converged, sizes_at = step.shorter(), shorter + 1, False, sizes_at + (count + 1 == sizes_at)
+            step, shorter, converged = step.shorter(), shorter + 1, False
+            systems = linearised(at) if alike and count + 1 == sizes_at else systems
         else:
             told = [e.information() for e in compress(systems, telling)]
             normal = held + sum(matrix for matrix, _ in told)
@@ -372,7 +374,7 @@ def _densities(systems: list[Equations]) -> tuple[list[list[NeedleFit]], Differi
     densities, variances = zip(*(e.free_densities() for e in systems), strict=True)
     few = sum(map(len, densities)) < LEAST_TELLING
     told = unknown(list(densities), SLANTED) if few else differing(list(densities), list(variances), MOST_DENSER, _DENSITIES_SURE)
-    if told is None:
+    if told is None or abs(told.typical) > SLANTED:  # by what all differ, the film's is not at rest yet
         return None
     sets = [
         [replace(f, denser=between(d, -MOST_DENSER, MOST_DENSER)) for f, d in zip(e.members, of, strict=True)]
