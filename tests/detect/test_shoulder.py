@@ -7,7 +7,7 @@ import pytest
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.film.shoulder import Curve, curve_of, rounding, shown
+from rsa_vision.detect.film.shoulder import Curve, curve_of, rounding, shown, told_by
 from rsa_vision.detect.film.tiles import QUANTISATION
 from rsa_vision.types import Float
 
@@ -40,6 +40,37 @@ def test_light_that_changes_in_black_film_is_part_of_stated_errors(least: float)
     print(f"least {least}: {len(error)} balls, RMS {np.sqrt((error**2).mean()):.4f} px, error / sd {np.sqrt(chi2.mean()):.2f}")
     assert np.sqrt(np.median(chi2)) < 1.5
     assert np.sqrt(chi2.max()) < 5
+
+
+def test_noise_of_the_scanner_does_not_belie_the_curve_of_its_film() -> None:
+    """It is the same on black film as under balls; that balls look the smaller the blacker it is beside them tells of the curve."""
+    rng = np.random.default_rng(43)
+    truth, radius = grid_of_balls(rng, 10, 90.0, (4.2, 4.6))
+    opacity = 1 - film_of_balls((SIDE, SIDE), truth, radius, background=1.0, depth=0.97, sigma_px=1.0)
+    light = 2.0 * np.exp(0.8 + 0.9 * np.sin(2 * np.pi * np.arange(SIDE) / 400.0))
+    film = stored(16 * (_density(light * (1 - opacity)) + 2.0 * rng.standard_normal((SIDE, SIDE))), bits=12)
+    found = detect_markers(film, bits=12).images
+    gap = np.hypot(*(truth[:, None] - found.position_px[None]).transpose(2, 0, 1))
+    index = gap.argmin(axis=1)[gap.min(axis=1) < 1.0]
+    error = found.position_px[index] - truth[gap.min(axis=1) < 1.0]
+    chi2 = np.einsum("ni,ni->n", error, np.linalg.solve(found.covariance_px2[index], error[:, :, None])[:, :, 0]) / 2
+    print(
+        f"{len(error)} balls, RMS {np.sqrt((error**2).mean()):.4f} px, error / sd {np.sqrt(chi2.mean()):.2f}, {np.sqrt(2 * chi2.max()):.1f}"
+    )
+    assert len(error) > 95
+    assert np.sqrt(np.median(chi2)) < 1.2
+    assert np.sqrt(2 * chi2.max()) < 4.5
+
+
+@pytest.mark.parametrize("depth", [-150.0, 150.0])
+def test_sizes_tell_of_a_curve_only_where_they_go_with_its_end(depth: float) -> None:
+    rng, curve = np.random.default_rng(3), Curve(BASE, BLACK, 0.0)
+    light = rng.uniform(-1, 4, 40)
+    background = curve.value(light if depth < 0 else -light)
+    sizes = np.where(rng.random(40) < 0.5, 4.6, 5.2)  # of two kinds
+    assert not told_by(background, np.full(40, depth), sizes, curve).told
+    assert told_by(background, np.full(40, depth), sizes * np.exp(-0.07 * np.maximum(light, 0.0)), curve).told
+    assert not told_by(background, np.full(40, -depth), sizes * np.exp(-0.07 * np.maximum(light, 0.0)), curve).told
 
 
 def _noise(level: list[float], variance: list[float]) -> NoiseModel:

@@ -22,6 +22,7 @@ _BLOCK = 32  # pixels in a row that show the light together
 _SEEN = 0.1  # of the steepest part of the curve, from which it shows
 _NO_NOISE = 1.5 * QUANTISATION  # variance of noise that rounding alone may be
 _NONE = 1e-6  # what is as good as none
+_NEAR, _LEAST_TELLING, _SURE = 1.0, 5, 5.0  # logarithm of the light; balls; standard deviations: sizes may go with places by chance
 _ROUNDED = 1 / (np.pi * np.sqrt(2))  # root mean square of what rounding does to a mean, without noise that breaks it up
 
 
@@ -35,11 +36,17 @@ class Curve:
         Its ends, in film values.
     shading : float
         Root mean square of the slope of the logarithm of the light, where the film shows it, 1 / px.
+    even : tuple of two floats
+        The least and the largest value that it has over a block of pixels, which noise does not move.
+    told : bool
+        Marks tell that it is one: they look smaller towards its end.
     """
 
     low: float
     high: float
     shading: float
+    even: tuple[float, float] = (-np.inf, np.inf)
+    told: bool = False
 
     def _between(self, values: Float) -> Float:
         return np.clip(values, self.low + _LEAST, self.high)
@@ -76,7 +83,8 @@ def curve_of(film: NDArray[Any]) -> Curve:
     middle = medians(rows[:, : count * _BLOCK].reshape(len(rows), count, _BLOCK))  # marks are narrower than half of that
     slope, climbs = np.diff(curve.logarithm(middle)) / _BLOCK, curve.slope(middle)
     seen = np.minimum(climbs[:, 1:], climbs[:, :-1]) > _SEEN * curve.slope(np.array((curve.low + curve.high) / 2))
-    return replace(curve, shading=float(np.sqrt(np.square(slope[seen]).mean())) if seen.any() else 0.0)
+    shading = float(np.sqrt(np.square(slope[seen]).mean())) if seen.any() else 0.0
+    return replace(curve, shading=shading, even=(float(middle.min(initial=np.inf)), float(middle.max(initial=-np.inf))))
 
 
 def shown(values: Float, background: Float, change: Float, curve: Curve, noise: NoiseModel) -> Float:
@@ -85,7 +93,7 @@ def shown(values: Float, background: Float, change: Float, curve: Curve, noise: 
     The characteristic curve of film, density against the logarithm of the exposure (Hurter and Driffield, 1890), is taken for a logistic
     one between its ends. A film of which the largest values are no end of its curve, as one that is linear in exposure, looks the same. But
     noise goes through the curve as well: the ratio of its standard deviations is the most that is believed of a curve, and on a linear film
-    there is less noise under a mark than beside it.
+    there is less noise under a mark than beside it. Unless marks tell: noise of a scanner does not go through the curve of its film.
 
     Parameters
     ----------
@@ -105,10 +113,43 @@ def shown(values: Float, background: Float, change: Float, curve: Curve, noise: 
     level = background[:, None]
     light = curve.logarithm(values) + curve.logarithm(level + change) - curve.logarithm(level)
     logistic = np.maximum(curve.slope(values) / curve.slope(level) - 1, _NONE)
+    if curve.told:
+        return np.asarray(np.where(logistic > _NONE, curve.value(light) - values - change, 0.0))
     there, here = (noise.variance_at(at) - _NO_NOISE for at in (values, level))
     most = np.sqrt(np.maximum(there, 0.0) / np.maximum(here, _NONE)) - 1
     part = np.where(logistic > _NONE, np.clip(most / logistic, 0.0, 1.0), 0.0)
     return np.asarray(part * (curve.value(light) - values - change))
+
+
+def told_by(background: Float, depth: Float, radius_px: Float, curve: Curve) -> Curve:
+    """Return the curve as balls tell it: they look the smaller the nearer the film beside them is to its end, which hides their rims.
+
+    Then it is one, and this end no farther than the film is over a block of pixels; the largest value of all is one of noise.
+
+    Parameters
+    ----------
+    background, depth, radius_px : ndarray of shape (n,)
+        Balls of any sizes.
+    curve : Curve
+
+    Returns
+    -------
+    Curve
+        The same where they do not.
+    """
+    light = curve.logarithm(background)
+    near = np.maximum(np.where(depth < 0, light, -light), 0.0)
+    if np.count_nonzero(near > _NEAR) < _LEAST_TELLING:
+        return curve
+    size, near = np.log(radius_px) - np.log(radius_px).mean(), near - near.mean()
+    spread = float(near @ near)
+    slope = float(near @ size) / spread
+    left = float(np.square(size - slope * near).sum()) / (len(size) - 2)
+    if slope >= -_SURE * np.sqrt(left / spread):
+        return curve
+    if np.median(depth) < 0:
+        return replace(curve, told=True, high=max(curve.even[1], float(background.max())))
+    return replace(curve, told=True, low=min(curve.even[0], float(background.min())))
 
 
 def unseen_slope(background: Float, half: int, curve: Curve, noise: NoiseModel) -> Float:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import EDGE
+from rsa_vision.detect.balls.decide import CLOSE, EDGE
 from rsa_vision.detect.balls.find import CHANCE
 from rsa_vision.detect.balls.fits import BallFits, uneven_white
 from rsa_vision.detect.balls.focal_spot import shapes_of
@@ -29,7 +29,7 @@ from rsa_vision.detect.balls.usual import Proportion, proportion, size_unlike, u
 from rsa_vision.detect.film.least_squares import chi2, polynomial
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.patches import cut
-from rsa_vision.detect.film.shoulder import Curve, curve_of, shown, unseen_slope
+from rsa_vision.detect.film.shoulder import Curve, curve_of, shown, told_by, unseen_slope
 from rsa_vision.detect.marks.resolve import Balls
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Beside, beside_each
@@ -150,6 +150,8 @@ def _fitted(
 ) -> _Fitted:
     balls, edged, drawn = found.fits, found.edged, found.drawn
     noise, under, curve = alike.noise, alike.under, curve_of(film)
+    clear = balls.rows(balls.explained > CLOSE)
+    curve = told_by(clear.background, clear.depth, clear.radius_px, curve)
     out, ratios, (covered, by_light) = replace(balls, covariance=under * balls.covariance), [], np.zeros((2, len(free)))
     left, every, louder, stayed = list[Left](), list[Specks](), list[Float](), np.ones(len(free), bool)
     for these in places:
