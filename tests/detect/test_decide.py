@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rsa_vision.detect.balls.decide import are_balls
@@ -36,3 +38,17 @@ def test_those_that_stand_out_of_less_noise_tell_as_well() -> None:
     depth = np.array([2976.0, 2943.0, 3020.0, 384.0, 321.0, 202.0, 174.0, 128.0, 115.0, 66.0, 66.0])
     background = np.array([884.0, 886.0, 980.0, 3493.0, 3545.0, 3791.0, 3799.0, 3877.0, 3885.0, 3945.0, 900.0])
     assert are_balls(clear_balls(depth, background), 6.0, 0.8, noise).tolist() == [True] * 10 + [False]
+
+
+def test_a_letter_on_a_bright_rim_does_not_say_how_high_the_balls_behind_a_limb_are() -> None:
+    """On a linear film: three balls that lap were the pattern, 25 times as high as ten behind the limb, of which three were lost."""
+    noise = NoiseModel(np.array([0.0, 65535.0]), np.array([2500.0, 60000.0]), WHITE, -1.0, 65536.0)
+    depth = np.concatenate([np.full(3, 48000.0), [2000.0, 1800.0, 1900.0, 1700.0, 1600.0, 1500.0, 1300.0, 1200.0, 800.0, 700.0]])
+    background = np.concatenate([np.full(3, 60000.0), np.full(10, 4000.0)])
+    letter, apart = np.array([[900.0, 1100.0], [905.0, 1100.0], [900.0, 1096.0]]), 60.0 * np.arange(1, 11)
+    fits = replace(clear_balls(depth, background), significance=depth / 60.0)
+    behind = replace(fits, position_px=np.concatenate([letter, np.column_stack([apart, apart])]))
+    assert are_balls(behind, 6.0, 0.8, noise)[3:].all()
+    three = replace(fits, position_px=np.concatenate([60.0 * letter, np.column_stack([apart, apart])]))
+    assert are_balls(three, 6.0, 0.8, noise)[:3].all()
+    assert not are_balls(three, 6.0, 0.8, noise)[-1]

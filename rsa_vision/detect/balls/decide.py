@@ -198,7 +198,7 @@ def _are_sure(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
 
 def _pattern(fits: BallFits, clear: Bool, sigma_px: float) -> tuple[Bool, Float]:
     """Say which stand as a pattern for others, and of which radii."""
-    pattern = _rather_on_film(_not_faint(clear & (fits.explained > CLOSE), height_of(fits, sigma_px)), fits)
+    pattern = _rather_on_film(_not_faint(clear & (fits.explained > CLOSE), height_of(fits, sigma_px), fits), fits)
     return pattern, _sizes(fits, pattern, sigma_px)
 
 
@@ -247,12 +247,29 @@ def _soft_shadows(radius_px: Float, height: Float, known: Bool) -> Bool:
     return np.asarray((radius_px > _LARGER * radius_px[known].max()) & (height < UNEXCUSED * np.median(height[known])))
 
 
-def _not_faint(pattern: Bool, height: Float) -> Bool:
-    """Take from patterns what is faint: a crowd of that, as edges make it on a film without noise, does not say what is usual."""
+def _not_faint(pattern: Bool, height: Float, fits: BallFits) -> Bool:
+    """Take from patterns what is faint: a crowd of that, as edges make it on a film without noise, does not say what is usual.
+
+    Nor does a letter or two on a bright rim, as several balls that lap: there marks behind a limb are faint as well.
+    """
     ranked = np.sort(height[pattern])
     total = np.cumsum(ranked)
     usual = ranked[np.searchsorted(total, 0.5 * total[-1])] if len(ranked) else 0.0
-    return np.asarray(pattern & (height > FAINT * usual))
+    high = np.asarray(pattern & (height > FAINT * usual))
+    rest = pattern & ~high
+    few = not _are_at(fits.rows(high), LEAST_KNOWN) and _are_at(fits.rows(rest), _COMPANY)
+    return _not_faint(rest, height, fits) if few else high
+
+
+def _are_at(fits: BallFits, count: int) -> bool:
+    """Say whether balls are at so many places or more; those that lap are at one."""
+    places = np.zeros((0, 3))
+    for at, radius in zip(fits.position_px, fits.radius_px, strict=True):
+        if len(places) == count:
+            break
+        if not (np.hypot(*(places[:, :2] - at).T) < places[:, 2] + radius).any():
+            places = np.append(places, [[*at, radius]], axis=0)
+    return len(places) >= count
 
 
 def _spread(fits: BallFits, sigma_px: float) -> Float:
