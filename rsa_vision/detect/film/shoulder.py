@@ -22,7 +22,8 @@ _BLOCK = 32  # pixels in a row that show the light together
 _SEEN = 0.1  # of the steepest part of the curve, from which it shows
 _NO_NOISE = 1.5 * QUANTISATION  # variance of noise that rounding alone may be
 _NONE = 1e-6  # what is as good as none
-_NEAR, _LEAST_TELLING, _SURE = 1.0, 5, 5.0  # logarithm of the light; balls; standard deviations: sizes may go with places by chance
+_NEAR, _APART, _BY = 1.0, 0.5, 0.1  # logarithms of the light, near the end and between balls; of radii, by which they are smaller
+_LEAST_TELLING, _SURE = 5, 5.0  # balls; standard deviations: sizes may go with places by chance
 _ROUNDED = 1 / (np.pi * np.sqrt(2))  # root mean square of what rounding does to a mean, without noise that breaks it up
 
 
@@ -143,9 +144,11 @@ def told_by(background: Float, depth: Float, radius_px: Float, curve: Curve) -> 
         return curve
     size, near = np.log(radius_px) - np.log(radius_px).mean(), near - near.mean()
     spread = float(near @ near)
+    if not spread > _APART**2 * len(near):  # on about one value: what noise does to it, it does to the radius of a fit as well
+        return curve
     slope = float(near @ size) / spread
     left = float(np.square(size - slope * near).sum()) / (len(size) - 2)
-    if slope >= -_SURE * np.sqrt(left / spread):
+    if slope >= -_SURE * np.sqrt(left / spread) or -slope * np.ptp(near) < _BY:
         return curve
     if np.median(depth) < 0:
         return replace(curve, told=True, high=max(curve.even[1], float(background.max())))

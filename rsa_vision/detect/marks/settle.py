@@ -150,7 +150,7 @@ def _fitted(
 ) -> _Fitted:
     balls, edged, drawn = found.fits, found.edged, found.drawn
     noise, under, curve = alike.noise, alike.under, curve_of(film)
-    clear = balls.rows(balls.explained > CLOSE)
+    clear = balls.rows((balls.explained > CLOSE) & (balls.hidden == 0))
     curve = told_by(clear.background, clear.depth, clear.radius_px, curve)
     out, ratios, (covered, by_light) = replace(balls, covariance=under * balls.covariance), [], np.zeros((2, len(free)))
     left, every, louder, stayed = list[Left](), list[Specks](), list[Float](), np.ones(len(free), bool)
