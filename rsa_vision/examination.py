@@ -198,7 +198,7 @@ def _with_cage(table: Readings, n_cage_films: int, study: Study, cage: Cage) -> 
     pairing = _pair(table, bundle, scale, study, region, slant=slant)
     complete = name_objects(named, table, bundle, pairing, foreign)
     reconstruction = reconstruct(complete.points, cage, study.limits, TIP_ERROR)
-    findings += _pair_findings(pairing, study) + lonely_images(table, pairing, bundle) + pins_left(table, pairing, bundle)
+    findings += _pair_findings(pairing, study) + lonely_images(table, pairing, bundle) + pins_left(table, pairing, bundle, region)
     result = _judged(complete, reconstruction, findings + judge(reconstruction, _nominal(study, cage), study.limits))
     return replace(result, sightlines=left_open(result.points, complete.rows, bundle, pairing, by_cage(reconstruction, cage)))
 
@@ -224,7 +224,7 @@ def _with_cameras(table: Readings, study: Study, cameras: Mapping[int, Camera]) 
     pairing = exact if len(exact.groups) >= len(tolerant.groups) else tolerant
     nothing = table.with_points(table.points.rows(~everything), table.rows[:0])
     complete = name_objects(nothing, table, bundle, pairing, ~everything)
-    findings = _pair_findings(pairing, study) + lonely_images(table, pairing, bundle) + pins_left(table, pairing, bundle)
+    findings = _pair_findings(pairing, study) + lonely_images(table, pairing, bundle) + pins_left(table, pairing, bundle, None)
     if not pairing.groups:
         return _failed(complete, [*findings, ("cage-not-found", "no image of one film meets one of the other: look at the calibration")])
     reconstruction = reconstruct_calibrated(complete.points, cameras, study.limits)

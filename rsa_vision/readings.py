@@ -12,7 +12,9 @@ import numpy as np
 from rsa_vision.flags import MarkerFlag
 from rsa_vision.geometry.rays import RayBundle, intersect_lines
 from rsa_vision.identify.cage import CageIdentification
+from rsa_vision.identify.clutter import more_than_clutter
 from rsa_vision.identify.contrasts import contrasts_alike
+from rsa_vision.identify.crossings import Region
 from rsa_vision.identify.lone import chance_of_marker
 from rsa_vision.identify.pairs import Pairing
 from rsa_vision.types import Bool, Float, ImagePoints, Int, MarkerImages
@@ -23,7 +25,6 @@ LOOKS_DOUBTFUL: Final = int(MarkerFlag.OVERLAP | MarkerFlag.EDGE | MarkerFlag.SA
 """Images whose size and contrast say little of their markers."""
 OBJECT_SHAPES: Final = ("ball", "pin")
 _MOST_TOLD: Final = 3  # places of one film that a message lists
-_SOME_PINS: Final = 2  # images: a single one may be a part of something else
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,11 +198,15 @@ def lonely_images(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[
     return found
 
 
-def pins_left(table: Readings, pairing: Pairing, bundle: RayBundle) -> list[Finding]:
-    """Find clear pins of films none of whose pins has a partner, so that nothing tells which of them are markers."""
+def pins_left(table: Readings, pairing: Pairing, bundle: RayBundle, region: Region | None) -> list[Finding]:
+    """Find clear pins of films none of whose pins has a partner and that are more than clutter: nothing tells which of them are markers."""
     points = table.points
-    left = pairing.unmatched[(points.shape[pairing.unmatched] == "pin") & (points.flags[pairing.unmatched] == 0)]
-    if len(left) < _SOME_PINS or any(points.shape[bundle.image[group[0]]] == "pin" for group in pairing.groups):
+    if any(points.shape[bundle.image[group[0]]] == "pin" for group in pairing.groups):
+        return []
+    free = np.isin(bundle.image, pairing.unmatched)
+    clear = free & (points.shape[bundle.image] == "pin") & (points.flags[bundle.image] == 0)
+    left = np.unique(bundle.image[more_than_clutter(bundle, clear, free, region, pairing.slack_mm)])
+    if not len(left):
         return []
     on = ", ".join(table.films[k].path.name for k in np.unique(points.film[left]))
     told = f"{len(left)} images of single pins ({on}) have no partner, and so no coordinates"

@@ -28,10 +28,12 @@ def pins_seen(places_px: list[list[float]], paired: int) -> list[tuple[str, str]
     images = MarkerImages(px, np.tile(np.eye(2), (n, 1, 1)), shape, look[0], np.full(n, np.nan), *look[1:], flags)
     table = Readings.of([FilmReading(Path(f"f{focus}.tif"), focus, (99, 99), None, "auto", images) for focus in (1, 2)])
     rays = np.arange(2 * n)
-    bundle = RayBundle(rays, 1 + rays // n, *np.zeros((2, 2 * n, 3)), np.zeros((2 * n, 6, 6)), np.zeros((2 * n, 6, 0)))
+    foci = np.array([[-240.0, 100.0, 1120.0], [240.0, 100.0, 1120.0]])
+    through = np.column_stack([np.tile(px, (2, 1)), np.zeros(2 * n)])  # equal images meet on the film
+    bundle = RayBundle(rays, 1 + rays // n, foci[rays // n], through, np.tile(1e-4 * np.eye(6), (2 * n, 1, 1)), np.zeros((2 * n, 6, 0)))
     groups, none = tuple((k, k + n) for k in range(paired + 1)), np.zeros(paired + 1)
     left = np.setdiff1d(rays, np.array(groups))
-    return pins_left(table, Pairing(groups, none, none > 0, none, left, 0.0, ()), bundle)
+    return pins_left(table, Pairing(groups, none, none > 0, none, left, 0.0, ()), bundle, None)
 
 
 def test_clear_pins_without_partners_are_told_where_no_pins_are_paired() -> None:
