@@ -20,45 +20,27 @@ from rsa_vision.detect.models.needles import NeedleFit
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import Window, window_of
-from rsa_vision.detect.needles.differing import (
-    LEAST_TELLING,
-    MOST_BLURRIER,
-    MOST_DENSER,
-    MOST_TAPER,
-    SLANTED,
-    Differing,
-    differing,
-    equal,
-    unknown,
+from rsa_vision.detect.needles.differing import equal
+from rsa_vision.detect.needles.equations import ATTENUATION, BLUR, OPTICS, TAPER, Equations, Shown, by_optics, linearise
+from rsa_vision.detect.needles.fits import excess_of
+from rsa_vision.detect.needles.irregular import ARMS, regular
+from rsa_vision.detect.needles.questions import (
+    MORE_STEPS,
+    OF_ARMS,
+    OF_BLURS,
+    OF_DENSITIES,
+    OF_TAPERS,
+    UNEVEN_ERROR,
+    Agenda,
+    odd_arms,
+    with_own_blurs,
+    with_own_densities,
+    with_own_tapers,
+    with_uneven_blur,
 )
-from rsa_vision.detect.needles.equations import (
-    ATTENUATION,
-    BENT,
-    BLUR,
-    OPTICS,
-    TAPER,
-    UNEVEN,
-    Equations,
-    Shown,
-    by_optics,
-    linearise,
-)
-from rsa_vision.detect.needles.fits import between, excess_of
-from rsa_vision.detect.needles.irregular import ARMS, Regularity, regular, told_by
 from rsa_vision.detect.needles.sets import beside_each, clusters
 from rsa_vision.detect.needles.stated import AtRest, quietest, with_errors
-from rsa_vision.detect.needles.states import (
-    LEAST_TAPER,
-    Sizes,
-    State,
-    Step,
-    change_of,
-    moved_optics,
-    of_several_lengths,
-    of_several_sizes,
-    of_usual_size,
-    sizes_of,
-)
+from rsa_vision.detect.needles.states import Sizes, State, Step, change_of, moved_optics, of_usual_size, sizes_of
 from rsa_vision.types import Float
 
 _STEPS = 12
@@ -70,12 +52,7 @@ _ATTENUATION_ERROR, _BLUR_ERROR = 0.7, 0.3  # of the logarithms, before the need
 _TAPER_ERROR = 0.1
 _SPOILT = 1.5  # times the chi2 of most pins: what leaves so much, on bone, tells nothing of what they have in common
 _SIZE_ERROR = 1.0  # of those, before
-_ASKED_AFTER = 4  # steps, after which it is asked at the latest how far arms and blurs differ: what differs does not converge
-_BLURS_AFTER, _TAPERS_AFTER, _MORE_STEPS = 3, 5, 6
-_DENSITIES_AFTER = 4  # steps with tapers of their own
-# logarithms of the odds from which they differ: by chance one film of a hundred gets to that of tapers; a curve feigns blurs that differ;
-# whether pins of several widths are of several metals, all they can tell counts
-_BLURS_SURE, _TAPERS_SURE, _DENSITIES_SURE = 3.0, 1.0, -np.inf
+_STEPS_AGAIN = 6  # of those that have gone astray
 _SIZES_AFTER = 2  # steps, from which sizes are near enough to tell how much they differ
 _DIRECTION_ERROR = 0.2  # radians, of the directions of arms against the first, before
 _SETTLED = 0.1  # conditional standard deviations of all that is common
@@ -83,10 +60,7 @@ _CURVE_ERROR, _CURVE_OF_PINS_ERROR, _TAIL_ERROR = (0.6, 0.1), (1.0, 0.1), 0.07
 _ENOUGH_PINS = 3  # that tell what comes after the film curve
 _PIXEL, _MOST_PIXEL = 1 / 12, 0.5  # px^2 of blur by the area of a scanner's pixel, and part of the variance that it may be at first
 _LATE_ERROR, _LOGGED_ERROR, _FIXED = 0.15, 2.5, 1e-3  # of what comes after the film curve, of the logarithm there, of either where it stays
-# of what is uneven of the blur: of a first estimate, and where that, or the needles as a whole, have told something of it
-_EVEN_ERROR, _UNEVEN_ERROR = 0.02, 0.2
-_OF_UNEVEN = np.eye(2) / _UNEVEN_ERROR**2
-_BY_CHANCE = 14.0  # chi2 of two degrees of freedom
+_EVEN_ERROR = 0.02  # of what is uneven of the blur, where no first estimate has told something of it
 # of attenuation, blur, taper, curve, tail, late, logged, uneven: changes from which derivatives by them are taken anew
 _MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1, 0.1, 0.5, 0.1, 0.1])
 _NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.5, 0.1, 0.1])  # changes of those with which the last step gets there
@@ -186,7 +160,7 @@ def _begin(
     unseen = balls.over if balls else None
     windows = [window_of(film, m, optics, noise, beside, unseen=unseen) for m, beside in zip(sets, others, strict=True)]
     windows = [w.with_edge(m, optics) if any(f.edged for f in m) else w for w, m in zip(windows, sets, strict=True)]
-    of_blur = _UNEVEN_ERROR if any(optics.uneven) else _EVEN_ERROR
+    of_blur = UNEVEN_ERROR if any(optics.uneven) else _EVEN_ERROR
     scanned = alike and len(needles) >= _ENOUGH_PINS
     of_scanner = [_LATE_ERROR, _LOGGED_ERROR] if scanned else [_FIXED, _FIXED]
     if not scanned:
@@ -223,10 +197,9 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
     converged : bool
     """
     windows, at, start, parallel, alike, telling = task.windows, task.at, task.start, task.parallel, task.alike, task.telling
-    precision, sizes, close = task.precision.copy(), at.sizes, _CONVERGED[len(at.sets[0][0].angles)] ** 2
+    precision, close = task.precision, _CONVERGED[len(at.sets[0][0].angles)] ** 2
     held = precision * task.gain
-    asked, asked_of_blurs, asked_of_tapers, asked_of_densities = False, False, not alike, not alike
-    sizes_at, densities_at = _SIZES_AFTER, 0
+    agenda, sizes_at = Agenda.of(alike=alike), _SIZES_AFTER
     slopes, since, of_each = list[list[NDArray[np.float32]]](), np.full(OPTICS, np.inf), at
     last: list[Shown | None] = [None] * len(windows)
     before: tuple[State, list[Shown], Step] | None = None
@@ -237,7 +210,7 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
         optics, each = moved_optics(start, at.moved), zip(windows, at.sets, slopes, at.expected, last, strict=True)
         return [linearise(w, m, k, optics, noise, parallel, expected, e) for w, m, k, expected, e in each]
 
-    for count in range(steps + 4 * _MORE_STEPS + 1):
+    for count in range(steps + sum(MORE_STEPS.values()) + _STEPS_AGAIN + 1):
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or _far_apart(at, of_each):
             slopes = [by_optics(w, m, moved_optics(start, at.moved)) for w, m in zip(windows, at.sets, strict=True)]
             since, of_each = at.moved[:OPTICS], at
@@ -255,7 +228,7 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
             if count == steps and not (converged or alike or restarted) and task.typical > _CLOSELY:
                 # some have gone astray, far from a straight line: tees of a film are of one size, and from there they all may get there
                 at, least, before, restarted = replace(at, sets=of_usual_size(at.sets)), np.inf, None, True
-                steps += _MORE_STEPS
+                steps += _STEPS_AGAIN
                 continue
             if count == steps or converged:
                 break
@@ -268,45 +241,29 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
             surprise = np.concatenate([e.surprise(own, _FINEST_PX) for e, own in zip(systems, step.own, strict=True)])
             converged = count > 0 and max(float(surprise.mean()), far if alike else 0.0) < close
             converged &= bool((np.abs(change[:OPTICS]) < _NEAR).all())  # the image as well as the tip: it is taken away for others
-            ask_of_blurs = (converged or count >= _BLURS_AFTER) and not asked_of_blurs
-            ask_of_tapers = (converged or count >= _TAPERS_AFTER) and count >= sizes_at and not asked_of_tapers
-            ask = (converged or count >= _ASKED_AFTER) and not asked  # near enough to tell how far their arms differ
-            with_tapers = (asked_of_tapers or ask_of_tapers) if converged else (asked_of_tapers and count >= densities_at)
-            ask_of_densities = with_tapers and not asked_of_densities
-            # what needles differ by, and not what noise and bone under them make of that
-            if ask_of_blurs or ask_of_tapers or ask_of_densities or ask:
+            answer: State | None = None
+            for question in agenda.due(count, converged, count >= sizes_at):
                 through = through or quietest(film, windows, systems, noise)
-                quiet = _filtered(windows, systems, through)
-            if ask_of_blurs:
-                asked_of_blurs = True
-                if differ := _blurs(quiet):
-                    moved = at.moved.copy()  # a curve that made up for them leads astray
-                    moved[BENT] = [-was for was in (*start.curve, start.tail, 0.0, start.logged, *start.uneven)]
-                    at = replace(at, sets=differ[0], blurs=differ[1], moved=moved, sizes=sizes)
-                    converged, least, before = False, np.inf, None
-                    steps, sizes_at = steps + _MORE_STEPS, count + 1 + _SIZES_AFTER
-                    continue
-            if ask_of_tapers:
-                asked_of_tapers, densities_at = True, count + _DENSITIES_AFTER
-                if of_several_lengths(at.sizes) and (pointed := _tapers(quiet, at)):
-                    at, converged, least, before = replace(at, sets=pointed[0], tapers=pointed[1]), False, np.inf, None
-                    steps += _MORE_STEPS
-                    continue
-            if ask_of_densities:
-                asked_of_densities = True
-                if of_several_sizes(at.sizes) and (dense := _densities(quiet)):
-                    at, converged, least, before = replace(at, sets=dense[0], densities=dense[1]), False, np.inf, None
-                    steps += _MORE_STEPS
-                    continue
-            if ask:
-                asked = True
-                odd = _odd(quiet, at) if parallel else None
-                if uneven := _is_uneven(precision, normal - held, target, at.moved, task.gain):
-                    precision[UNEVEN, UNEVEN] = _OF_UNEVEN
-                    held = precision * task.gain
-                if odd or uneven:
-                    at, converged, least, before = replace(at, regularity=odd or at.regularity), False, np.inf, None
-                    continue
+                quiet = quiet or _filtered(windows, systems, through)  # what needles differ by, and not what noise and bone make of that
+                if question == OF_BLURS:
+                    answer = with_own_blurs(quiet, at, task.at, start)
+                    sizes_at = sizes_at if answer is None else count + 1 + _SIZES_AFTER
+                elif question == OF_TAPERS:
+                    answer = with_own_tapers(quiet, at)
+                elif question == OF_DENSITIES:
+                    answer = with_own_densities(quiet, at)
+                elif question == OF_ARMS:
+                    odd = odd_arms(quiet, at) if parallel else None
+                    if (uneven := with_uneven_blur(precision, normal - held, target, at.moved, task.gain)) is not None:
+                        precision, held = uneven, uneven * task.gain
+                    if odd or uneven is not None:
+                        answer = replace(at, regularity=odd or at.regularity)
+                if answer is not None:
+                    steps += MORE_STEPS[question]
+                    break
+            if answer is not None:
+                at, converged, least, before = answer, False, np.inf, None
+                continue
             if converged and not alike:
                 break  # from so near the last step gets there as well; that to the sizes of all is longer
         before, last = (at, seen, step), [*seen]
@@ -328,71 +285,8 @@ def _filtered(windows: list[Window], systems: list[Equations], through: Filter) 
     return [e.filtered(w, through) for e, w in zip(systems, windows, strict=True)]
 
 
-def _odd(systems: list[Equations], at: State) -> Regularity | None:
-    """How far arms differ, where they do."""
-    if at.regularity is None:
-        return None
-    ways, variances = zip(*(e.free_ways(at.regularity.common) for e in systems), strict=True)
-    return told_by(list(ways), list(variances), at.regularity)
-
-
 def _far_apart(at: State, before: State) -> bool:
     """Say whether some needles have changed so much of their own that derivatives by what is common are taken anew."""
     blurrier, tapers = np.abs(at.own_blurs - before.own_blurs), np.abs(at.own_tapers - before.own_tapers)
     denser = np.abs(at.own_densities - before.own_densities)
     return bool(blurrier.max() > _MUCH[BLUR] or tapers.max() > _MUCH[TAPER] or denser.max() > _MUCH[ATTENUATION])
-
-
-def _blurs(systems: list[Equations]) -> tuple[list[list[NeedleFit]], Differing] | None:
-    """Needles with blurs of their own, and how far these differ, where they do."""
-    blurs, variances = zip(*(e.free_blurs() for e in systems), strict=True)
-    told = differing(list(blurs), list(variances), MOST_BLURRIER, _BLURS_SURE)
-    if told is None:
-        return None
-    sets = [
-        [replace(f, blurrier=between(b, -MOST_BLURRIER, MOST_BLURRIER)) for f, b in zip(e.members, of, strict=True)]
-        for e, of in zip(systems, blurs, strict=True)
-    ]
-    return sets, told
-
-
-def _tapers(systems: list[Equations], at: State) -> tuple[list[list[NeedleFit]], Differing] | None:
-    """Pins with tapers of their own, and how far these differ, where they do."""
-    tapers, variances = zip(*(e.free_tapers() for e in systems), strict=True)
-    told = differing(list(tapers), list(variances), MOST_TAPER, _TAPERS_SURE)
-    if told is None:
-        return None
-    sets = [
-        [replace(f, shape=replace(f.shape, taper=between(t, LEAST_TAPER, 1.0))) for f, t in zip(e.members, of, strict=True)]
-        for e, of in zip(systems, tapers, strict=True)
-    ]
-    return sets, replace(told, typical=told.typical - at.taper)
-
-
-def _densities(systems: list[Equations]) -> tuple[list[list[NeedleFit]], Differing] | None:
-    """Pins with attenuations of their own, and how far these differ, where they do."""
-    densities, variances = zip(*(e.free_densities() for e in systems), strict=True)
-    few = sum(map(len, densities)) < LEAST_TELLING
-    told = unknown(list(densities), SLANTED) if few else differing(list(densities), list(variances), MOST_DENSER, _DENSITIES_SURE)
-    if told is None or abs(told.typical) > SLANTED:  # by what all differ, the film's is not at rest yet
-        return None
-    sets = [
-        [replace(f, denser=between(d, -MOST_DENSER, MOST_DENSER)) for f, d in zip(e.members, of, strict=True)]
-        for e, of in zip(systems, densities, strict=True)
-    ]
-    return sets, told
-
-
-def _is_uneven(precision: Float, told: Float, target: Float, moved: Float, gain: float) -> bool:
-    """Say whether what needles tell, (c, c) and (c,), makes the blur uneven that was taken as even so far.
-
-    ``precision``: of the common parameters before; ``moved``: what they differ from the start; ``gain``: of the variances, by noise that
-    neighbours share.
-    """
-    free = precision.copy()
-    free[UNEVEN, UNEVEN] = _OF_UNEVEN
-    if (free == precision).all():
-        return False
-    covariance = np.linalg.inv(told + gain * free)
-    uneven = moved[UNEVEN] + (covariance @ (target - gain * free @ moved))[UNEVEN]
-    return bool(uneven @ np.linalg.solve(covariance[UNEVEN, UNEVEN], uneven) > gain * _BY_CHANCE)
