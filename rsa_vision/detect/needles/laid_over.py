@@ -40,7 +40,7 @@ class LaidOver:
     likeness : float
         Correlation coefficient with the film there, less a quadratic surface.
     pin : NeedleFit
-        Where it begins a fit.
+        Where it begins a fit, with depth and background as they look there.
     """
 
     place: Float
@@ -69,24 +69,29 @@ def laid_over(film: NDArray[Any], places: Float, pins: Sequence[NeedleFit], opti
     places, pixel = places[first_there], pixel[first_there]
     best = np.full(len(places), -1.0)
     which = np.zeros((len(places), 2), np.intp)
+    seen = np.zeros((len(places), 2))  # depth and background
     coarse = optics.pooled(_SCALE)
     for k, pin in enumerate(pins):
         half = _SCALE * math.ceil((pin.shape.length_px + 2 * optics.sigma_px) / _SCALE)
-        surface, images = _bare_images(pin.shape, half, coarse)
+        surface, images, length = _bare_images(pin.shape, half, coarse)
         for first in range(0, len(places), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             values = _around(film, pixel[part], half)
+            background = values.mean(axis=1)
             values -= values @ surface @ surface.T
             answer = np.sign(pin.depths[0]) * (values @ images.T)
             way = answer.argmax(axis=1)
-            like = answer[np.arange(len(way)), way] / np.maximum(np.linalg.norm(values, axis=1), 1e-9)
+            most = answer[np.arange(len(way)), way]
+            like = most / np.maximum(np.linalg.norm(values, axis=1), 1e-9)
             better = like > best[part]
+            seen[part][better] = np.column_stack([np.sign(pin.depths[0]) * most / length[way], background])[better]
             best[part][better], which[part][better] = like[better], np.column_stack([np.full(len(way), k), way])[better]
     out = []
     for i in np.argsort(-best, kind="stable"):
         pin = pins[which[i, 0]]
         tip, angle = _lying(pin.shape.length_px)[which[i, 1]]
-        out.append(LaidOver(places[i], float(best[i]), replace(pin, position_px=pixel[i] + tip, angles=np.array([angle]))))
+        start = replace(pin, position_px=pixel[i] + tip, angles=np.array([angle]), depth=float(seen[i, 0]), background=float(seen[i, 1]))
+        out.append(LaidOver(places[i], float(best[i]), start))
     return out
 
 
@@ -97,8 +102,8 @@ def _lying(length_px: float) -> list[tuple[Float, float]]:
 
 
 @lru_cache(maxsize=_KEPT)
-def _bare_images(shape: NeedleShape, half: int, optics: Optics) -> tuple[Float, Float]:
-    """Return quadratic surfaces (n, 6), and what a bright pin shows besides them every way round (ways, n), both of length one."""
+def _bare_images(shape: NeedleShape, half: int, optics: Optics) -> tuple[Float, Float, Float]:
+    """Return quadratic surfaces (n, 6), what a bright pin shows besides them each way round (ways, n), both of length one, and how long."""
     axis = np.arange(-half, half, _SCALE) + (_SCALE - 1) / 2
     cols, rows = (grid.ravel() for grid in np.meshgrid(axis, axis))
     surface = np.linalg.qr(polynomial(half, cols, rows))[0]
@@ -107,7 +112,8 @@ def _bare_images(shape: NeedleShape, half: int, optics: Optics) -> tuple[Float, 
     square = np.reshape(quarter, (-1, len(axis), len(axis)))
     images = np.concatenate([np.rot90(square, turn, axes=(1, 2)) for turn in range(4)]).reshape(len(ways), -1)
     images -= images @ surface @ surface.T
-    return surface, images / np.linalg.norm(images, axis=1, keepdims=True)
+    length = np.linalg.norm(images, axis=1)
+    return surface, images / length[:, None], length
 
 
 def _around(film: NDArray[Any], pixel: Int, half: int) -> Float:

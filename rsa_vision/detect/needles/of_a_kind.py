@@ -68,6 +68,8 @@ def others_like(film: NDArray[Any], known: list[NeedleFit], places: Float, optic
     tried, in_vain = np.zeros((0, 2)), 0
     for start in laid_over(film, places[~on_arms(places, known)], [typical], optics):
         tip = start.pin.position_px
+        if not _is_as_deep(start.pin, typical, _ROUGHLY * _PALE):
+            continue
         if on_arms(start.place[None], out).any() or (np.hypot(*(tried - tip).T) < typical.shape.half_width_px).any():
             continue  # from so near a fit ends at the same pin
         tried, in_vain = np.append(tried, tip[None], axis=0), in_vain + 1
@@ -167,13 +169,19 @@ def _is_like(film: NDArray[Any], fit: NeedleFit, typical: NeedleFit, optics: Opt
 
 def is_of_kind(fit: NeedleFit, typical: NeedleFit, noise: NoiseModel) -> bool:
     """Say whether a fit looks like a pin of the typical size and is as deep, or of as large a part of what is there."""
+    return bool(is_pin(fit, noise, STANDS_OUT_ROUGHLY) and are_of_one_size(fit, typical) and _is_as_deep(fit, typical, _PALE))
+
+
+def are_of_one_size(one: NeedleFit, other: NeedleFit) -> bool:
+    """Say whether two fits are nearly as large as each other."""
+    return bool((np.abs(np.diff(_log_sizes([one, other]), axis=0)) < _ALIKE).all())
+
+
+def _is_as_deep(fit: NeedleFit, typical: NeedleFit, part: float) -> bool:
+    """Say whether the depth of a fit, or the part of the background that it is, is that of a typical one, to a factor of ``part``."""
     deep = fit.depth / typical.depth
     of_background = deep * max(typical.background, 1.0) / max(fit.background, 1.0)
-    return bool(
-        is_pin(fit, noise, STANDS_OUT_ROUGHLY)
-        and (np.abs(np.diff(_log_sizes([fit, typical]), axis=0)) < _ALIKE).all()
-        and any(_PALE < ratio < 1 / _PALE for ratio in (deep, of_background))
-    )
+    return any(part < ratio < 1 / part for ratio in (deep, of_background))
 
 
 def are_alike(pins: list[NeedleFit]) -> bool:

@@ -18,7 +18,15 @@ from rsa_vision.detect.needles.balls_beside import BallsBeside
 from rsa_vision.detect.needles.crossing import chi2_of, window_of
 from rsa_vision.detect.needles.first_pins import best_tapered, distinct_pins, likest_pins
 from rsa_vision.detect.needles.fits import between, excess_of, fit_needles, significant_misfit
-from rsa_vision.detect.needles.of_a_kind import are_alike, are_as_thick, are_of_a_kind, odd_lengths, others_like, without_company
+from rsa_vision.detect.needles.of_a_kind import (
+    are_alike,
+    are_as_thick,
+    are_of_a_kind,
+    are_of_one_size,
+    odd_lengths,
+    others_like,
+    without_company,
+)
 from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
 from rsa_vision.detect.needles.pointed import (
     EXPLAINED,
@@ -112,9 +120,9 @@ def _found_from(
     # a wide blur feigns a short point
     _, taper, sample = _likeliest(film, [f for f in sample if is_pin(f, noise)], [optics], noise, tapers)
     width, length = (float(np.median([getattr(f.shape, name) for f in sample])) for name in ("half_width_px", "length_px"))
-    starts = [(replace(f.shape, taper=taper), NeedleShape(width, length, taper)) for f in rough]
+    usual = NeedleShape(width, length, taper)
     even = replace(optics, uneven=(0.0, 0.0))  # which way of those is the best does not hang on that, and it takes a table for each angle
-    fits = [[_refit(film, replace(f, shape=shape), even, noise) for shape in shapes] for f, shapes in zip(rough, starts, strict=True)]
+    fits = [_of_either_size(film, f, usual, even, noise) for f in rough]
     if len(trials) > 1:  # optics were guessed at first: whichever way round a pin began says little
         fits = [[*ways, *(_refit(film, either_way(f)[1], even, noise) for f in ways)] for ways in fits]
     best = [min(ways, key=unexplained) for ways in fits]
@@ -244,6 +252,15 @@ def _likeliest(
     least = np.min(list(chi2.values()), axis=0)
     best = min(chi2, key=lambda trial: worse(chi2[trial], least))
     return *best, fits[best]
+
+
+def _of_either_size(film: NDArray[Any], rough: NeedleFit, usual: NeedleShape, optics: Optics, noise: NoiseModel) -> list[NeedleFit]:
+    """Fit from the size of a first look, and from the usual one unless that is where the fit has come to."""
+    own = _refit(film, replace(rough, shape=replace(rough.shape, taper=usual.taper)), optics, noise)
+    usually = replace(rough, shape=usual)
+    if is_pin(own, noise) and own.explained > EXPLAINED and are_of_one_size(own, usually):  # noise makes many ends of one fit
+        return [own]
+    return [own, _refit(film, usually, optics, noise)]
 
 
 def on_pins(position_px: Float, left: Float, pins: list[NeedleFit]) -> Bool:
