@@ -67,6 +67,8 @@ def fit_at(
     BallFits
         In the order of the positions.
     """
+    if not len(radius_px):
+        return no_fits()
     halves = np.array([half_size(r, optics.sigma_px) for r in radius_px])
     order, parts = np.argsort(halves, kind="stable"), []
     begin = 0

@@ -137,6 +137,16 @@ class NoiseModel:
         """Return the variance of a mean over Gaussians of these widths, in units of that of white noise."""
         return np.asarray((_blurred(spread_px) * self.correlation).sum((-2, -1)))
 
+    def gain_of_length(self, spread_px: float) -> float:
+        """Return the variance of how much longer than wide a Gaussian of this width is, in units of that in white noise.
+
+        That shows in the second derivative of the Gaussian, whose correlation with itself is the fourth of one wider by the root of two.
+        """
+        lag = np.arange(-LAGS, LAGS + 1) / spread_px
+        along = 1 - lag**2 + lag**4 / 12
+        seen = _blurred(np.array(spread_px)) * self.correlation
+        return float(max((seen @ along).sum(), (along @ seen).sum()))
+
     @property
     def blur_px(self) -> float:
         """Standard deviation of the Gaussian that has blurred it; zero where a part of it is white, and the rest may be structure."""

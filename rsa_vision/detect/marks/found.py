@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.crowd import all_but_noise, lost_in_a_crowd, out_of_a_crowd
 from rsa_vision.detect.balls.decide import CLOSE, LEAST_KNOWN, above_noise, are_balls, faint_beside, look_clear, show_what_marks_are_like
-from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, fit_at, misfit, plausible, short_of_end
+from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, distinct, fit_at, misfit, plausible, short_of_end
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
@@ -20,13 +20,13 @@ from rsa_vision.detect.film.places import are_within, gaps
 from rsa_vision.detect.marks.beaded import find_beaded
 from rsa_vision.detect.marks.mixed import part
 from rsa_vision.detect.marks.noise_curve import noise_by_value
-from rsa_vision.detect.marks.polarity import Seen, off_pins
+from rsa_vision.detect.marks.polarity import Seen, look_off_holes, off_pins
 from rsa_vision.detect.marks.resolve import Balls, resolve_balls
 from rsa_vision.detect.marks.second_look import look_again
 from rsa_vision.detect.marks.settle import STRUCTURE, settle
 from rsa_vision.detect.marks.table import NEEDLES_ALIKE, WHOLE, table_of, what_is_left
 from rsa_vision.detect.marks.unsteady import Marks, by_lines, unsteady_lines
-from rsa_vision.detect.models.needles import NeedleFit, needle_image
+from rsa_vision.detect.models.needles import NeedleFit, middle, needle_image
 from rsa_vision.detect.models.painted import Painted, paint
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images, nothing
@@ -52,6 +52,7 @@ _AT_NEEDLES = 1.5  # of their lengths, from the tip: what the search answers to 
 _SMOOTHED, _MUCH_MORE = 1.15, 2.0  # blur of the noise over that of the marks, noise under these over that beside them, from which one did
 _USUAL_BLUR = 0.6  # of the noise at marks, over theirs
 _BESIDE = 2.0, 3.0  # of the radius of a ball, and pixels more, within which the search answers to it
+_SHORT = 6.5  # length over half the width, of two balls side by side and their blur; pins are longer
 _MOST_IN_VAIN = 6  # tees that balls may hide, where there is no other
 _BENT = 1.5  # of what a ball may leave, once an edge or bending surfaces around it could have taken it up
 
@@ -147,7 +148,17 @@ def _find_needles(
     pins, pin_optics = find_pins(film, rough_pins, places[free], lines, perhaps, sign, optics, noise)
     tees, pins = [_seen(tees, noise), _seen([p for p in pins if is_located(p)], noise)]
     painted = _painted(tees, pins, tee_optics, pin_optics)
-    return _Needles(tees, pins, doubtful, tee_optics, pin_optics, off_pins(seen.looks, more_pins), painted)
+    hidden = _under_no_pins(film, mine, rough_pins, [*perhaps, *pins], noise)
+    looks = off_pins(seen.looks, more_pins)
+    looks = distinct(join([looks, hidden]), noise) if len(hidden.depth) else looks
+    return _Needles(tees, pins, doubtful, tee_optics, pin_optics, looks, painted)
+
+
+def _under_no_pins(film: NDArray[Any], mine: Candidates, rough: list[NeedleFit], needles: list[NeedleFit], noise: NoiseModel) -> BallFits:
+    """First looks at what lies on short strokes that have turned out to be no pins: two balls side by side are as long."""
+    refuted = [p for p in rough if p.shape.length_px < _SHORT * p.shape.half_width_px and not on_arms(middle(p)[None], needles).any()]
+    here = mine.rows((mine.roundness > ROUNDNESS) & on_arms(mine.position_px, refuted))
+    return look_off_holes(film, here, noise)
 
 
 def _with_beaded(film: NDArray[Any], found: Balls, needles: _Needles, seen: Seen) -> _Needles | None:

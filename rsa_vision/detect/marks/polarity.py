@@ -122,9 +122,14 @@ def first_looks(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit
 
 
 def _look(film: NDArray[Any], candidates: Candidates, pins: list[NeedleFit], noise: NoiseModel) -> BallFits:
+    return off_pins(look_off_holes(film, candidates, noise), pins)
+
+
+def look_off_holes(film: NDArray[Any], candidates: Candidates, noise: NoiseModel) -> BallFits:
+    """Look at candidates for balls, and leave out the gaps between others, and what lossy compression may have made."""
     looks = first_look(film, candidates, noise)
     looks = looks.rows(noise.rises_above(height_of(looks, COARSE_SIGMA_PX), looks.background))
-    return off_pins(looks.rows(~are_holes(film, looks, COARSE_SIGMA_PX)), pins)
+    return looks.rows(~are_holes(film, looks, COARSE_SIGMA_PX))
 
 
 def off_pins(fits: BallFits, pins: list[NeedleFit]) -> BallFits:

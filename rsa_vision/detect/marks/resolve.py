@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import LEAST_KNOWN, hopeless, look_clear
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, height_of, hopeless, look_clear
 from rsa_vision.detect.balls.find import CHANCE, COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.focal_spot import Spot
@@ -32,6 +32,8 @@ from rsa_vision.types import Bool, Float, Int
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
 _COMPANY, _COARSE = 3, 0.6  # peaks beside one that a group may start from; of the radius, from which they are a ball's own
 _NECKS, _BAR = 1.7, 0.03  # of the radius, between balls in a row of which one does not touch another; misfit that they may leave
+# radius of two balls beside each other as one; of theirs and the blur, up to which what answers is a peak; part of their height; peaks
+_OF_TWO, _PEAK, _HIGH, _MOST_PEAKS = 1.6, 2.0, 0.4, 100
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
 
@@ -149,6 +151,9 @@ def resolve_balls(
     clean[asked] = ~are_not_round(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, beside, *at), optics, noise)
     sure = single.rows(clean)
     blobs = single.rows(~clean & ~_taken(single, sure))
+    if len(sure.depth) >= LEAST_KNOWN:
+        peaks, size = _lone_peaks(film, candidates, single, sure, optics, beside)
+        blobs = join([blobs, fit_at(film, peaks, size, optics, noise, others, quick=True)])
     split = len(sure.depth) > 0 or needles is None  # else what arms leave is all there is
     pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, beside)) if split else []
     fits += pairs
@@ -346,6 +351,21 @@ def _unexplained_pairs(
         used[[i, *company]] = True
         out.append(np.column_stack([starts, np.full(len(starts), typical)]))
     return out[:200]
+
+
+def _lone_peaks(
+    film: NDArray[Any], candidates: Candidates, single: BallFits, sure: BallFits, optics: Optics, beside: Images | None
+) -> tuple[Float, Float]:
+    """Places (n, 2) as high as balls that no single one explains, strongest first, and radii: two that nearly touch have one peak."""
+    typical, height = float(np.median(sure.radius_px)), float(np.median(height_of(sure, optics.sigma_px)))
+    peaks = candidates.position_px[candidates.radius_px <= _PEAK * (typical + optics.sigma_px)]
+    peaks = peaks[deep_at(film, peaks, typical + optics.sigma_px, beside) > _HIGH * height]
+    peaks = peaks[~are_within(peaks, single.position_px, np.maximum(typical, 0.9 * single.radius_px))]
+    places = np.zeros((0, 2))
+    for peak in peaks:
+        if len(places) < _MOST_PEAKS and not (np.hypot(*(places - peak).T) < 2 * typical).any():
+            places = np.append(places, peak[None], axis=0)
+    return places, np.full(len(places), _OF_TWO * typical)
 
 
 def _chain(peaks: Float, first: Int, free: Bool, own_px: float, neck_px: float, touch_px: float) -> Int:

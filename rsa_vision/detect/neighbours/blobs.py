@@ -65,7 +65,7 @@ def split_blobs(
     least_radius, most_radius, least_depth = min(s.radius for s in sizes), max(s.radius for s in sizes), min(s.depth for s in sizes)
     worth = (blobs.radius_px > _BLOB[0] * least_radius) & (blobs.radius_px < _BLOB[1] * most_radius)
     worth &= (np.abs(blobs.depth) > _DEPTH[0] * least_depth) & (blobs.explained > 0.6)
-    least = LEAST_GAIN * noise.correlation.sum() / (np.pi * most_radius**2)
+    of_length = noise.gain_of_length(float(np.hypot(optics.sigma_px, most_radius / 2)))
     out: list[BallFits] = []
     tried = 0
     for i in np.nonzero(worth)[0]:
@@ -77,6 +77,7 @@ def split_blobs(
         tried += 1
         others = beside()
         whole = fit_group(film, place[None], blobs.radius_px[[i]], optics.sigma_px, optics.mu_px, noise, others)
+        least = LEAST_GAIN * of_length / float(whole.n_core[0])
         if whole.chi2_core[0] <= least:
             continue  # even two that left nothing would not be better by enough
         axis = long_axis(film, whole, np.sign(blobs.depth[i]))
