@@ -151,8 +151,8 @@ def resolve_balls(
     clean[asked] = ~are_not_round(film, one_each, lambda i, *at: images_beside(one_each, np.array([i]), optics, beside, *at), optics, noise)
     sure = single.rows(clean)
     blobs = single.rows(~clean & ~_taken(single, sure))
-    if len(sure.depth) >= LEAST_KNOWN:
-        peaks, size = _lone_peaks(film, candidates, single, sure, optics, beside)
+    if sized:
+        peaks, size = _lone_peaks(film, candidates, single, like, optics, beside)
         blobs = join([blobs, fit_at(film, peaks, size, optics, noise, others, quick=True)])
     split = len(sure.depth) > 0 or needles is None  # else what arms leave is all there is
     pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, beside)) if split else []
@@ -354,10 +354,10 @@ def _unexplained_pairs(
 
 
 def _lone_peaks(
-    film: NDArray[Any], candidates: Candidates, single: BallFits, sure: BallFits, optics: Optics, beside: Images | None
+    film: NDArray[Any], candidates: Candidates, single: BallFits, like: BallFits, optics: Optics, beside: Images | None
 ) -> tuple[Float, Float]:
     """Places (n, 2) as high as balls that no single one explains, strongest first, and radii: two that nearly touch have one peak."""
-    typical, height = float(np.median(sure.radius_px)), float(np.median(height_of(sure, optics.sigma_px)))
+    typical, height = float(np.median(like.radius_px)), float(np.median(height_of(like, optics.sigma_px)))
     peaks = candidates.position_px[candidates.radius_px <= _PEAK * (typical + optics.sigma_px)]
     peaks = peaks[deep_at(film, peaks, typical + optics.sigma_px, beside) > _HIGH * height]
     peaks = peaks[~are_within(peaks, single.position_px, np.maximum(typical, 0.9 * single.radius_px))]

@@ -206,7 +206,6 @@ def _by_optics(base: Single, half_width: float, length: float, taper: float, opt
     dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
     wide = _opacity(half_width, length, taper, optics, slant, blurrier=factor)
     short = _opacity(half_width, length, taper - STEP, optics, slant)
-    straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0), logged=0.0), slant)
     along, oblique = optics.uneven
     others = [
         replace(optics, tail=optics.tail + STEP),
@@ -216,8 +215,13 @@ def _by_optics(base: Single, half_width: float, length: float, taper: float, opt
         replace(optics, uneven=(along, oblique + STEP)),
     ]
     steps = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
-    by_curve = [np.asarray(of, np.float32) for of in by_film_curve(straight, optics.curve)]
-    return [*steps, *by_curve, *((_opacity(half_width, length, taper, other, slant) - base) / STEP for other in others)]
+    bow, skewness = optics.curve
+    if optics.late:
+        others = [replace(optics, curve=(bow + STEP, skewness)), replace(optics, curve=(bow, skewness + STEP)), *others]
+    else:  # nothing is blurred after it
+        straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0), logged=0.0), slant)
+        steps += [np.asarray(of, np.float32) for of in by_film_curve(straight, optics.curve)]
+    return [*steps, *((_opacity(half_width, length, taper, other, slant) - base) / STEP for other in others)]
 
 
 def look_up(values: Single, at_s: Float, at_p: Float) -> Float:

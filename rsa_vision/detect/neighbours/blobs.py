@@ -25,7 +25,7 @@ STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
 _BLOB = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
 _DEPTH = (0.4, 2.5)  # depths of the two, relative to balls of their size
 OF_A_BLOB = 0.8  # of the radius of a ball fitted to two
-CLEAR, NEARLY = 2.0 * SURE, 0.6  # significance of blobs that tell, and the part of them that one ball explains
+CLEAR, NEARLY = 2.0 * SURE, 0.6  # significance of blobs that tell, and the part of blobs that one ball explains
 _VAIN = 40  # attempts of a film that may fail
 _COMPANY = 2  # balls of one size
 
@@ -64,7 +64,10 @@ def split_blobs(
     sizes = _sizes(like, noise) if len(balls.depth) else [_Size(OF_A_BLOB * usual.radius, usual.depth)]
     least_radius, most_radius, least_depth = min(s.radius for s in sizes), max(s.radius for s in sizes), min(s.depth for s in sizes)
     worth = (blobs.radius_px > _BLOB[0] * least_radius) & (blobs.radius_px < _BLOB[1] * most_radius)
-    worth &= (np.abs(blobs.depth) > _DEPTH[0] * least_depth) & (blobs.explained > 0.6)
+    deep = np.abs(blobs.depth) > _DEPTH[0] * least_depth
+    # how deep balls hardly wider than the blur are is not told, but how much they take away in all
+    deep |= np.abs(blobs.depth) * blobs.radius_px**2 > min(s.depth * s.radius**2 for s in sizes)
+    worth &= deep & (blobs.explained > NEARLY)
     of_length = noise.gain_of_length(float(np.hypot(optics.sigma_px, most_radius / 2)))
     out: list[BallFits] = []
     tried = 0
