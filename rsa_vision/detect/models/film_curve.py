@@ -1,7 +1,8 @@
 """What film shows of the light that marks leave: how much of it is gone, bent by the curve of the film.
 
-Most films and plates record the logarithm of the exposure, or a power of it: with the logarithm ``k`` of the contrast between all the light
-and what is left under full opacity, the logarithm shows ``-log(1 - (1 - exp(-k)) o) / k`` of the opacity ``o``.
+Density and transmitted light shift the log odds of the opacity, and skew them a little. Where film or plate records the logarithm of the
+light, and nothing scatters into the shadow, all of that under thick metal comes from the steep end of the logarithm: no such shift follows
+that, so that a positive skewness leads to the logarithm itself.
 """
 
 from __future__ import annotations
@@ -14,43 +15,62 @@ from numpy.typing import NDArray
 
 from rsa_vision.types import Float
 
-_STRAIGHT: Final = 1e-4  # below it nothing of the bend is left but its derivative
+_STRAIGHT: Final = 1e-3  # bends below which logarithms and shifts differ by nothing but a skewness
+_OF_LOG: Final = 1 / 6  # of the square of its bend is the skewness of a logarithm, to the first order
+
+
+def skewness_of_log(bend: float) -> float:
+    """Return the skewness that makes a logarithm of a curve with this bend."""
+    return _OF_LOG * bend**2
 
 
 def film_curve(opacity: NDArray[Any], curve: tuple[float, float]) -> Float:
     """What film shows of blurred opacities, by the two coefficients of :attr:`Optics.curve`."""
-    shown = _logged(opacity, curve[0])
-    return np.asarray(shown + curve[1] * shown * (1 - shown) * (1 - 2 * shown))
+    return np.asarray(_shifted(opacity, curve[0]) + curve[1] * _skew(opacity, curve))
 
 
 def by_film_curve(opacity: NDArray[Any], curve: tuple[float, float]) -> list[Float]:
     """Derivatives of what film shows by the two coefficients of its curve, whatever is blurred after it."""
-    shown, within = _logged(opacity, curve[0]), np.clip(opacity, 0.0, 1.0)
-    inside = shown * (1 - shown)
-    if abs(curve[0]) < _STRAIGHT:
-        bow = within * (1 - within)
-    else:
-        bow = (math.exp(2 * curve[0]) * within / (1 + math.expm1(2 * curve[0]) * within) - np.clip(shown, 0.0, 1.0)) / curve[0]
-    return [bow * (1 + curve[1] * (1 - 6 * inside)), inside * (1 - 2 * shown)]
+    bend, skewness = curve
+    shifted = _shifted(opacity, bend)
+    bow = shifted * (1 - shifted)
+    if not _is_logged(curve):
+        return [bow * (1 + skewness * (1 - 6 * bow)), _skew(opacity, curve)]
+    within, factor = np.clip(opacity, 0.0, 1.0), math.expm1(2 * bend)
+    by_bend = ((factor + 1) * within / (1 + factor * within) - np.log1p(factor * within) / (2 * bend)) / bend
+    skew = _skew(opacity, curve)
+    return [bow + skewness * ((by_bend - bow) / skewness_of_log(bend) - 2 * skew / bend), skew]
 
 
 def slope_of_film_curve(opacity: NDArray[Any], curve: tuple[float, float]) -> Float:
     """Derivative of what film shows by the blurred opacity."""
-    shown, within = _logged(opacity, curve[0]), np.clip(opacity, 0.0, 1.0)
-    return np.asarray(_slope(within, curve[0]) * (1 + curve[1] * (1 - 6 * shown * (1 - shown))))
-
-
-def _slope(opacity: NDArray[Any] | float, bend: float) -> Float:
-    if abs(bend) < _STRAIGHT:
-        return 1 + bend * (1 - 2 * np.asarray(opacity))
+    bend, skewness = curve
+    shifted, within = _shifted(opacity, bend), np.clip(opacity, 0.0, 1.0)
+    slope = math.exp(bend) / (1 + math.expm1(bend) * within) ** 2
+    if not _is_logged(curve):
+        return np.asarray(slope * (1 + skewness * (1 - 6 * shifted * (1 - shifted))))
     factor = math.expm1(2 * bend)
-    return np.asarray(factor / (2 * bend) / (1 + factor * np.asarray(opacity)))
+    return np.asarray(slope + skewness * (factor / (2 * bend) / (1 + factor * within) - slope) / skewness_of_log(bend))
 
 
-def _logged(opacity: NDArray[Any], bend: float) -> Float:
-    """Logarithm of the light, ``bend`` being half the contrast with its sign; overshoots, which may have none, go on straight."""
+def _is_logged(curve: tuple[float, float]) -> bool:
+    """Say whether the skew leads to the logarithm: of a curve the other way about that would be one of the shadow."""
+    return curve[0] < -_STRAIGHT and curve[1] > 0
+
+
+def _shifted(opacity: NDArray[Any], by: float) -> Float:
+    """Opacities whose log odds are by so much more; those of overshoots, which have none, go on straight."""
     within = np.asarray(np.clip(opacity, 0.0, 1.0), np.float64)
     beyond = opacity - within
-    straight = abs(bend) < _STRAIGHT
-    shown = within * (1 + bend * (1 - within)) if straight else np.log1p(math.expm1(2 * bend) * within) / (2 * bend)
-    return np.asarray(shown + beyond * np.where(beyond < 0, _slope(0.0, bend), _slope(1.0, bend)))
+    factor = math.exp(by)
+    return np.asarray(within / (within + (1 - within) / factor) + beyond * np.where(beyond < 0, factor, 1 / factor))
+
+
+def _skew(opacity: NDArray[Any], curve: tuple[float, float]) -> Float:
+    """What a skewness of one adds to the shift: zero at either end."""
+    bend, shifted = curve[0], _shifted(opacity, curve[0])
+    if not _is_logged(curve):
+        return np.asarray(shifted * (1 - shifted) * (1 - 2 * shifted))
+    within = np.asarray(np.clip(opacity, 0.0, 1.0), np.float64)
+    logged = np.log1p(math.expm1(2 * bend) * within) / (2 * bend)
+    return np.asarray((logged - _shifted(within, bend)) / skewness_of_log(bend))

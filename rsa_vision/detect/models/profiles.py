@@ -35,9 +35,10 @@ class Optics:
     mu_px : float
         Attenuation per pixel of chord. It takes part of the bend of the film curve: flatter tops, more attenuation.
     curve : tuple of float
-        The rest of it, which pins tell, and balls that lie over each other: of the blurred opacity ``o`` film shows
-        ``g + curve[1] g (1 - g) (1 - 2 g)``, where ``g`` is the logarithm of the light that is left, ``1 - (1 - exp(2 curve[0])) o``, in
-        units of that at full opacity, ``2 curve[0]``. Negative where film answers more the more of its light is gone, as density does.
+        The rest of it, which pins tell, and balls that lie over each other: of the blurred opacity ``o`` film shows ``g``, the log odds of
+        which are those of ``o`` plus ``curve[0]``, and ``curve[1]`` times a skew, ``g (1 - g) (1 - 2 g)`` where that is negative; where it
+        is not, one with which ``curve[0] ** 2 / 6`` makes the logarithm of ``1 - (1 - exp(2 curve[0])) o``. Negative bends where film
+        answers more the more of its light is gone, as density does.
     tail : float
         Part of the light that is spread ``TAIL`` times as far as the rest: of screens, scanners and scatter nearby.
     late : float

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.optics import CAP
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.models.film_curve import skewness_of_log
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, either_way, middle, unexplained
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.balls_beside import BallsBeside
@@ -48,8 +49,9 @@ _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth o
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length: of what beams and film curves are besides, by the curve and the logarithm of the depth, by the others
 _OF_MODEL, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.0015, 0.05, 0.03, 2.0
-# by the skewness of a curve that is no logarithm, and by how far beams of several energies bend that of the light under thick metal
-_OF_SKEWNESS, _OF_BEAM = 0.03, 0.003
+# by how far the skewness of a curve is from those of logarithms and roots (in units of their bend), and the more so the steeper it is where
+# it is less than theirs, as of transmitted light; by how far beams of several energies bend the light under thick metal
+_OF_CURVE, _OF_STEEP, _OF_ROOTS, _OF_BEAM = 0.03, 0.007, -0.2, 0.003
 # tail below which a film may have been sharpened, by how much less it surely was, and error along a pin by that in units of the blur
 _OF_LIGHT, _OF_LIGHT_ERROR, _BY_SHARPENING = -0.1, 0.1, 0.8
 _NO_OTHER = 0.15  # from a usual taper: the last fit gets there itself
@@ -314,7 +316,9 @@ def _less_sure_along(fit: NeedleFit, typical: float, odd_px: float, optics: Opti
     # where film responds more or less than usual, it is bent more or less as well
     unlike = abs(math.log(fit.depth / typical))
     shift, skewness = optics.curve
-    by_curve = [_OF_SKEWNESS * skewness, _OF_BEAM * shift, _OF_UNLIKE * shift * unlike]
+    usual = sorted([skewness_of_log(shift), _OF_ROOTS * shift])
+    odd = skewness - between(skewness, *usual)
+    by_curve = [(_OF_CURVE + _OF_STEEP * abs(shift) ** 3 * (odd < 0)) * odd, _OF_BEAM * shift, _OF_UNLIKE * shift * unlike]
     by_model = np.array([_OF_MODEL, *by_curve, _OF_TAIL * optics.tail, by_rest])
     sharpened = between((_OF_LIGHT - optics.tail) / _OF_LIGHT_ERROR, 0.0, 1.0)
     parts = [odd_px, _POINT * fit.shape.half_width_px, _BY_SHARPENING * sharpened * optics.sigma_px, *(fit.shape.length_px * by_model)]

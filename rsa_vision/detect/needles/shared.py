@@ -7,7 +7,6 @@ from one needle these are poor, from all of them they are good. Each needle's ow
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 from itertools import compress
 from typing import Any
@@ -211,7 +210,7 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
         optics, each = moved_optics(start, at.moved), zip(windows, at.sets, slopes, at.expected, last, strict=True)
         return [linearise(w, m, k, optics, noise, parallel, expected, e) for w, m, k, expected, e in each]
 
-    for count in itertools.count():
+    for count in range(steps + sum(MORE_STEPS.values()) + _STEPS_AGAIN + 1):
         if (np.abs(at.moved[:OPTICS] - since) > _MUCH).any() or _far_apart(at, of_each):
             slopes = [by_optics(w, m, moved_optics(start, at.moved)) for w, m in zip(windows, at.sets, strict=True)]
             since, of_each = at.moved[:OPTICS], at
@@ -220,7 +219,7 @@ def _come_near(film: NDArray[Any], task: _Task, noise: NoiseModel, steps: int) -
         cost = sum(e.cost for e in systems) + float(at.moved @ held @ at.moved)
         if before and cost > least + task.n_free and shorter < _SHORTER and count < steps:
             at, seen, step = before  # far from a straight line: back, and not as far; what was seen from there tells nothing
-            step, shorter, steps, converged = step.shorter(), shorter + 1, steps + 1, False
+            step, shorter, converged = step.shorter(), shorter + 1, False
             systems = linearised(at) if alike and count + 1 == sizes_at else systems
         else:
             told = [e.information() for e in compress(systems, telling)]

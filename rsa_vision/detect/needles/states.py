@@ -32,7 +32,7 @@ from rsa_vision.types import Float
 
 LEAST_TAPER = 0.1
 _SEVERAL = 0.05  # spread of the logarithms of lengths; slants of up to 25 degrees make 0.03
-_MOST = 3.0, 0.8, 0.6  # curve and tail
+_BOUNDS = (-3.0, 3.0), (-0.8, 1.5), (-0.6, 0.6)  # of the curve, whose skewness is largest where it is a logarithm, and of the tail
 _MOST_LATE, _MOST_LOGGED = 0.6, 3.0
 _MOST_UNEVEN = 0.8
 _MOST_BY_STEP, _MOST_TAPER_BY_STEP, _MOST_LOGGED_BY_STEP = 0.6, 0.2, 2.0
@@ -201,7 +201,7 @@ def _as_far(change: Float) -> float:
 def moved_optics(start: Optics, by: Float) -> Optics:
     """Optics with these changes of the logarithms of attenuation and blur, of curve, tail, what is late, logged and what is uneven."""
     bow, skewed, tail = (
-        between(was + step, -most, most) for was, step, most in zip((*start.curve, start.tail), by[3:6], _MOST, strict=True)
+        between(was + step, *bounds) for was, step, bounds in zip((*start.curve, start.tail), by[3:6], _BOUNDS, strict=True)
     )
     late, logged = between(start.late + by[LATE], 0.0, _MOST_LATE), between(start.logged + by[LOGGED], 0.0, _MOST_LOGGED)
     dense, blurred = np.exp(by[:2]).tolist()
