@@ -16,7 +16,7 @@ from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.profiles import BallTable, Optics, ball_table
 from rsa_vision.types import Bool, Float, Int
 
-_NARROWEST_PX, _WIDTHS = 0.96, 5.0  # standard deviation of the narrowest image; variances of a ball in its radius
+_NARROWEST_PX, _WIDTHS = 1.3, 5.0  # standard deviation of the narrowest image; variances of a ball in its radius
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are what is looked for
 _STEPS, _QUICK_STEPS = 12, 4
 _REWEIGHTED = (1, 2)  # steps
