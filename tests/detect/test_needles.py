@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
-from rsa_vision.detect.models.film_curve import by_film_curve, film_curve
+from rsa_vision.detect.models.film_curve import by_film_curve, film_curve, skewness_of_log, slope_of_film_curve
 from rsa_vision.detect.models.needles import NeedleShape, arm_images, arms_by_optics
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float
@@ -118,6 +118,25 @@ def test_what_is_blurred_after_the_film_curve(late_px: float, density: float) ->
     right = missed(late_px**2 / variance, logged)
     assert right < 0.02
     assert missed(0.0, 0.0) > 1.5 * right
+
+
+@pytest.mark.parametrize("left", [0.3, 0.05, 0.003])
+def test_logarithms_of_light_are_followed_whatever_is_left(left: float) -> None:
+    """A polynomial for the skewness left 0.4 % of the depth at 2 % of light, and tips 2 % of their length off."""
+    opacity = np.linspace(0.0, 1.0, 50)
+    bend = 0.5 * np.log(left)
+    expected = np.log(1 - (1 - left) * opacity) / np.log(left)
+    assert np.allclose(film_curve(opacity, (bend, skewness_of_log(bend))), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("curve", [(-1.7, 0.3), (-0.8, -0.2), (0.6, 0.3), (0.0, 0.1), (-0.03, 0.1), (-2.5, 1.0)])
+def test_slopes_of_the_film_curve(curve: tuple[float, float]) -> None:
+    opacity, step = np.linspace(0.01, 0.99, 50), 1e-6
+    high, low = (film_curve(opacity + sign * step, curve) for sign in (1, -1))
+    assert np.allclose(slope_of_film_curve(opacity, curve), (high - low) / (2 * step), atol=1e-7)
+    for k, slope in enumerate(by_film_curve(opacity, curve)):
+        high, low = (film_curve(opacity, tuple(np.array(curve) + sign * step * np.eye(2)[k])) for sign in (1, -1))
+        assert np.allclose(slope, (high - low) / (2 * step), atol=1e-6)
 
 
 def test_derivatives_of_the_film_curve() -> None:

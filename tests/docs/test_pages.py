@@ -16,7 +16,7 @@ from rsa_vision.cage_drawing import draw_cage
 from rsa_vision.cages import Cage, Mark, Plane, builtin_cages, load_cage, symmetries
 from rsa_vision.flags import REASONS, MarkerFlag, flag_names
 from rsa_vision.geometry.covariance import SIGNIFICANCE
-from rsa_vision.identify import film_model
+from rsa_vision.identify import clutter, film_model
 from rsa_vision.settings import Limits, Study
 from rsa_vision.tables import DETECTIONS, SCHEMAS
 from rsa_vision.verdict import FAILURES
@@ -94,7 +94,7 @@ def test_every_setting() -> None:
 
 def test_numbers_of_the_method_are_those_of_the_code() -> None:
     text = page("method.md")
-    known = {name: value for module in (verdict, readings, film_model) for name, value in vars(module).items() if name.isupper()}
+    known = {name: value for module in (verdict, readings, film_model, clutter) for name, value in vars(module).items() if name.isupper()}
     stated = re.findall(r"`([A-Z_]+)` = ([\d.]+)", text)
     stated += [(codes(row[0])[0], row[1]) for row in rows(section("method.md", "Names of the cage's marks"))]
     assert len(stated) >= 10

@@ -16,7 +16,6 @@ from rsa_vision.detect.film.whitening import whiten_rows
 from rsa_vision.detect.models.profiles import BallTable, Optics, ball_table
 from rsa_vision.types import Bool, Float, Int
 
-_NARROWEST_PX, _WIDTHS = 1.3, 5.0  # standard deviation of the narrowest image; variances of a ball in its radius
 RADIUS_PX = (1.2, 16.0)  # fitted radii stay between; marks of 2.5 to 12 are what is looked for
 _STEPS, _QUICK_STEPS = 12, 4
 _REWEIGHTED = (1, 2)  # steps
@@ -95,13 +94,8 @@ def join(parts: list[BallFits]) -> BallFits:
 
 
 def radii(sigma_px: float) -> tuple[float, float]:
-    """Return the smallest and the largest radius of a fit: less against the blur is any speck, and tables end.
-
-    What is as wide as the smallest marks on a sharp film may be smaller on one with more blur: on films that record the logarithm of the
-    exposure, marks look smaller than they are.
-    """
-    smaller = float(np.sqrt(max(_WIDTHS * (_NARROWEST_PX**2 - sigma_px**2), 0.0)))
-    return max(min(RADIUS_PX[0], smaller), 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px)
+    """Return the smallest and the largest radius of a fit: less against the blur is any speck, and tables end."""
+    return max(RADIUS_PX[0], 0.42 * sigma_px), min(RADIUS_PX[1], 20.0 * sigma_px)
 
 
 def half_size(radius_px: float, sigma_px: float) -> int:

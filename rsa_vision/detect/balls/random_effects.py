@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsa_vision.detect.balls.cut_off import grounds_cut_off
-from rsa_vision.detect.balls.fits import BallFits, radii
+from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits
 from rsa_vision.detect.balls.focal_spot import Spot, shapes_of
 from rsa_vision.detect.balls.surroundings import Modes
 from rsa_vision.detect.balls.usual import Proportion, Size
@@ -142,7 +142,7 @@ def solve(windows: Windows, known: Modes, structure: Float, common: Common) -> S
         change = np.matmul(inverse, right[:, :, None])[:, :, 0]
         scale = np.minimum(1.0, _MAX_STEP_PX / np.maximum(np.abs(change[:, :3]).max(axis=1), 1e-12))
         local, before = local + scale[:, None] * change[:, :2], radius
-        radius = np.clip(radius + scale * change[:, 2], *radii(sigma_px))
+        radius = np.clip(radius + scale * change[:, 2], *RADIUS_PX)
         far = bool((np.abs(change[:, :3]) > _FAR_PX).any())
         depth, theta = depth + scale * change[:, 3], change[:, 4:]
         residual = left - np.matmul(change[:, None], images)[:, 0]
@@ -207,8 +207,7 @@ def hold(fits: BallFits, common: Common) -> tuple[Float, Float]:
     """Return where the radius of each is held and how strongly, the inverse of a variance; not at all where it has a size of its own."""
     apart = np.abs(np.log(fits.radius_px) - common.size.log_radius)
     own = apart > _OUTLIER * np.hypot(common.size.spread, np.sqrt(fits.covariance[:, 2, 2]) / fits.radius_px)
-    low, high = radii(common.optics.sigma_px)
-    at_limit = (fits.radius_px <= low) | (fits.radius_px >= high)
+    at_limit = (fits.radius_px <= RADIUS_PX[0]) | (fits.radius_px >= RADIUS_PX[1])
     held = np.where(own, 0.0, 1 / common.size.radius_sd_px**2)
     return np.where(at_limit, fits.radius_px, common.size.radius_px), np.where(at_limit, _FIXED, held)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rsa_vision.types import Float
 
-_STRAIGHT: Final = 1e-3  # bends below which logarithms and shifts differ by nothing but a skewness
+_STRAIGHT: Final = 0.02  # bends below which logarithms and shifts differ by hardly more than a skewness
 _OF_LOG: Final = 1 / 6  # of the square of its bend is the skewness of a logarithm, to the first order
 
 
@@ -46,11 +46,10 @@ def slope_of_film_curve(opacity: NDArray[Any], curve: tuple[float, float]) -> Fl
     """Derivative of what film shows by the blurred opacity."""
     bend, skewness = curve
     shifted, within = _shifted(opacity, bend), np.clip(opacity, 0.0, 1.0)
-    slope = math.exp(bend) / (1 + math.expm1(bend) * within) ** 2
+    slope = _slope_of_shift(within, bend)
     if not _is_logged(curve):
         return np.asarray(slope * (1 + skewness * (1 - 6 * shifted * (1 - shifted))))
-    factor = math.expm1(2 * bend)
-    return np.asarray(slope + skewness * (factor / (2 * bend) / (1 + factor * within) - slope) / skewness_of_log(bend))
+    return np.asarray(slope + skewness * _slope_of_log_skew(within, bend))
 
 
 def _is_logged(curve: tuple[float, float]) -> bool:
@@ -73,4 +72,14 @@ def _skew(opacity: NDArray[Any], curve: tuple[float, float]) -> Float:
         return np.asarray(shifted * (1 - shifted) * (1 - 2 * shifted))
     within = np.asarray(np.clip(opacity, 0.0, 1.0), np.float64)
     logged = np.log1p(math.expm1(2 * bend) * within) / (2 * bend)
-    return np.asarray((logged - _shifted(within, bend)) / skewness_of_log(bend))
+    straight_on = (opacity - within) * _slope_of_log_skew(within, bend)
+    return np.asarray((logged - _shifted(within, bend)) / skewness_of_log(bend) + straight_on)
+
+
+def _slope_of_shift(within: Float, bend: float) -> Float:
+    return np.asarray(math.exp(bend) / (1 + math.expm1(bend) * within) ** 2)
+
+
+def _slope_of_log_skew(within: Float, bend: float) -> Float:
+    factor = math.expm1(2 * bend)
+    return np.asarray((factor / (2 * bend) / (1 + factor * within) - _slope_of_shift(within, bend)) / skewness_of_log(bend))
