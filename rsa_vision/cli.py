@@ -169,7 +169,7 @@ def measure(
 def detect(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Films.", readable=False)],  # that fails for its film alone
     out: Annotated[Path, typer.Option("--out", "-o", help="File for the result: .csv or .parquet.")],
-    overlay: Annotated[Path | None, typer.Option("--overlay", help="PNG file for a drawing of what was found.")] = None,
+    overlay: Annotated[Path | None, typer.Option("--overlay", help="PNG for a drawing; of several images each NAME_IMAGE.png.")] = None,
     response: Annotated[
         str, typer.Option("--response", help="auto, density, transmission, linear or log; nothing depends on it: the film tells.")
     ] = "auto",
