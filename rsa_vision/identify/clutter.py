@@ -41,15 +41,16 @@ def more_than_clutter(bundle: RayBundle, asked: Bool, others: Bool, region: Regi
     ndarray of bool, shape (n,)
         Of the focus's rays that are asked none, or all.
     """
+    if not asked.any():
+        return np.zeros(len(bundle), bool)
     meets, expected = _met(bundle, others, region, slack_mm)
     result = np.zeros(len(bundle), bool)
+    exposures = PRESUMED[1] + max(len(np.unique(bundle.focus)) - 1, 1)
     for focus in np.unique(bundle.focus[asked]):
         mine = asked & (bundle.focus == focus)
         elsewhere = asked & (bundle.focus != focus)
-        films = max(len(np.unique(bundle.focus)) - 1, 1)
-        thick, exposures = PRESUMED[0] + elsewhere.sum(), PRESUMED[1] + films
         met = int(meets[mine].sum())
-        many = nbinom.sf(mine.sum() - 1, thick, exposures / (exposures + 1)) < BY_CHANCE
+        many = nbinom.sf(mine.sum() - 1, PRESUMED[0] + elsewhere.sum(), exposures / (exposures + 1)) < BY_CHANCE
         found = met >= LEAST and poisson.sf(met - 1, expected[mine].sum()) < BY_CHANCE
         if mine.sum() >= LEAST and (many or found):
             result |= mine

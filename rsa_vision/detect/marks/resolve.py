@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsa_vision.detect.balls.decide import LEAST_KNOWN, height_of, hopeless, look_clear
+from rsa_vision.detect.balls.decide import LEAST_KNOWN, hopeless, look_clear
 from rsa_vision.detect.balls.find import CHANCE, COARSE_SIGMA_PX, DOUBTFUL, MISFIT, SURE, distinct, fit_at, misfit, plausible, promising
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.focal_spot import Spot
 from rsa_vision.detect.balls.usual import over_kinds
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.places import are_within, gaps, on_film
+from rsa_vision.detect.marks.peaks import NECKS, lone_peaks, unexplained_pairs
 from rsa_vision.detect.models.painted import Painted
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images, for_all
-from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, all_but, deep_at, groups_of, heaps_of, images_beside, lapping_balls
+from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, TOUCH, all_but, groups_of, heaps_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.blobs import split_blobs
 from rsa_vision.detect.neighbours.crowds import resolve_crowds
 from rsa_vision.detect.neighbours.edges import NEAR_EDGES, balls_beside_edges
@@ -30,10 +31,7 @@ from rsa_vision.detect.search.candidates import Candidates
 from rsa_vision.types import Bool, Float, Int
 
 _LARGER, _UNLIKE, _LEAST_UNLIKE = 1.1, 3.0, 0.015  # of two in one: radius and misfit against the known ones, least misfit
-_COMPANY, _COARSE = 3, 0.6  # peaks beside one that a group may start from; of the radius, from which they are a ball's own
-_NECKS, _BAR = 1.7, 0.03  # of the radius, between balls in a row of which one does not touch another; misfit that they may leave
-# radius of two balls beside each other as one; of theirs and the blur, up to which what answers is a peak; part of their height; peaks
-_OF_TWO, _PEAK, _HIGH, _MOST_PEAKS = 1.6, 2.0, 0.4, 100
+_BAR = 0.03  # misfit that balls in a row may leave of which one does not touch another
 _LIKE = 0.35  # logarithm of the radius, against the film's median
 
 
@@ -134,7 +132,7 @@ def resolve_balls(
     clear = look_clear(good, noise)
     sized = bool(np.count_nonzero(clear) >= LEAST_KNOWN)
     like = good.rows(clear) if sized else good
-    for members in _unexplained_pairs(film, candidates, good, like, sized, optics, beside):
+    for members in unexplained_pairs(film, candidates, good, like, sized, optics, beside):
         pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, beside)
         # one peak too many takes part of a ball, and then there is none
         while sized and len(pair.depth) > 2 and not _like(pair, like).all():
@@ -152,7 +150,7 @@ def resolve_balls(
     sure = single.rows(clean)
     blobs = single.rows(~clean & ~_taken(single, sure))
     if sized:
-        peaks, size = _lone_peaks(film, candidates, single, like, optics, beside)
+        peaks, size = lone_peaks(film, candidates, single, like, optics, beside)
         blobs = join([blobs, fit_at(film, peaks, size, optics, noise, others, quick=True)])
     split = len(sure.depth) > 0 or needles is None  # else what arms leave is all there is
     pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, beside)) if split else []
@@ -312,80 +310,6 @@ def _like(fits: BallFits, known: BallFits) -> Bool:
     )
 
 
-def _unexplained_pairs(
-    film: NDArray[Any], candidates: Candidates, good: BallFits, like: BallFits, sized: bool, optics: Optics, beside: Images | None
-) -> list[Float]:
-    """Starts of groups, rows of (col, row, radius), at peaks off all known balls.
-
-    ``like`` says what a ball is like on this film; ``sized``: and how large it is.
-    """
-    if len(good.depth) == 0:
-        return []
-    typical = float(np.median(like.radius_px))
-    fine = np.nonzero(candidates.radius_px <= 3.0)[0] if typical < 6 else np.arange(len(candidates.strength))
-    peaks = candidates.position_px[fine]
-    if len(peaks) == 0:
-        return []
-    deep = deep_at(film, peaks, typical, beside) > 0.4 * np.median(np.abs(like.depth))
-    fine, peaks = fine[deep], peaks[deep]
-    if len(peaks) == 0:
-        return []
-    free = ~are_within(peaks, good.position_px, np.maximum(0.6 * typical, 0.9 * good.radius_px))
-    out = []
-    used = np.zeros(len(peaks), bool)
-    for i in np.nonzero(free)[0]:
-        if used[i]:
-            continue
-        gap = np.hypot(*(peaks - peaks[i]).T)
-        own, touching = 0.6 * typical, 2 * typical + TOUCH * optics.sigma_px
-        company = np.nonzero((gap < touching) & (gap > own) & free & ~used)[0]
-        if len(company) < _COMPANY:
-            company = _chain(peaks, np.append(i, company), free & ~used, own, _NECKS * typical, touching)
-        if sized and len(company) > _COMPANY:  # fine peaks lie all along the rim of a large ball
-            company = company[candidates.radius_px[fine[company]] > _COARSE * typical]
-        company = company[np.argsort(gap[company])][: MOST_IN_GROUP - 1]
-        known = good.position_px[np.hypot(*(good.position_px - peaks[i]).T) < 2 * typical + TOUCH * optics.sigma_px]
-        if len(company) + len(known) == 0 or len(company) > _COMPANY:
-            continue
-        starts = np.concatenate([peaks[[i]], peaks[company], known])[:MOST_IN_GROUP]
-        used[[i, *company]] = True
-        out.append(np.column_stack([starts, np.full(len(starts), typical)]))
-    return out[:200]
-
-
-def _lone_peaks(
-    film: NDArray[Any], candidates: Candidates, single: BallFits, like: BallFits, optics: Optics, beside: Images | None
-) -> tuple[Float, Float]:
-    """Places (n, 2) as high as balls that no single one explains, strongest first, and radii: two that nearly touch have one peak."""
-    typical, height = float(np.median(like.radius_px)), float(np.median(height_of(like, optics.sigma_px)))
-    peaks = candidates.position_px[candidates.radius_px <= _PEAK * (typical + optics.sigma_px)]
-    peaks = peaks[deep_at(film, peaks, typical + optics.sigma_px, beside) > _HIGH * height]
-    peaks = peaks[~are_within(peaks, single.position_px, np.maximum(typical, 0.9 * single.radius_px))]
-    places = np.zeros((0, 2))
-    for peak in peaks:
-        if len(places) < _MOST_PEAKS and not (np.hypot(*(places - peak).T) < 2 * typical).any():
-            places = np.append(places, peak[None], axis=0)
-    return places, np.full(len(places), _OF_TWO * typical)
-
-
-def _chain(peaks: Float, first: Int, free: Bool, own_px: float, neck_px: float, touch_px: float) -> Int:
-    """Return all but the first of some peaks, with those that touch these, and so on, if they are few and one behind the other.
-
-    Where they touch each other all round there may be anything of that size: a full stop of lead passes for four balls. Nearer to each
-    other they show no necks, as a wire shows none.
-    """
-    chain = first
-    while len(chain) <= _COMPANY + 1:
-        nearest = gaps(peaks, peaks[chain]).min(axis=1)
-        more = np.flatnonzero(free & (nearest < touch_px) & (nearest > own_px))
-        if not len(more):
-            apart = gaps(peaks[chain], peaks[chain])
-            links = apart[np.triu(apart < touch_px, 1)]
-            return chain[1:] if len(links) < len(chain) and links.min(initial=np.inf) > neck_px else first[1:]
-        chain = np.append(chain, more[nearest[more].argmin()])
-    return first[1:]
-
-
 def _is_bar(fits: BallFits, like: BallFits, touch_px: float, noise: NoiseModel) -> bool:
     """Say whether balls in a row, of which one does not touch another, lap too far to show necks, or leave what single ones do not.
 
@@ -396,7 +320,7 @@ def _is_bar(fits: BallFits, like: BallFits, touch_px: float, noise: NoiseModel) 
         return False
     left = misfit(fits, noise)
     unlike = (left > max(_UNLIKE * float(np.median(misfit(like, noise))), _BAR)) & (fits.chi2_core > 1 + 5 * noise.scatter(fits.n_core))
-    return bool(unlike.any() or (apart.min(axis=1) < _NECKS * fits.radius_px).any())
+    return bool(unlike.any() or (apart.min(axis=1) < NECKS * fits.radius_px).any())
 
 
 def _peel(film: NDArray[Any], fits: BallFits, optics: Optics, noise: NoiseModel, beside: Images | None) -> BallFits:
