@@ -327,3 +327,10 @@ def test_pins_at_whose_tips_three_arms_meet_say_so() -> None:
     assert perhaps_arms([pin], meeting + np.array([30.0, 0, 0, 0, 0])).tolist() == [False]
     assert perhaps_arms([replace(pin, angles=np.array([np.pi / 4]))], meeting).tolist() == [False]
     assert perhaps_arms([pin], np.zeros((0, 5))).tolist() == [False]
+
+
+def test_pins_that_begin_at_one_place_may_be_arms_of_a_tee() -> None:
+    pin = replace(_TEE, angles=np.array([np.pi / 2]), depths=np.full(1, -900.0), position_px=np.array([50.0, 50.0]))
+    width = 2 * pin.shape.half_width_px
+    other, third = (replace(pin, angles=np.zeros(1), position_px=np.array([50.0 + by * width, 50.0])) for by in (0.9, 3.0))
+    assert perhaps_arms([pin, other, third], np.zeros((0, 5))).tolist() == [True, True, False]

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.models.needles import NeedleFit, wrapped
 from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.types import Bool, Float
@@ -26,20 +27,23 @@ _AS_HIGH = 0.5  # of the pin's own height there
 def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
     """Say which pins may be what is seen of a tee: an edge may hide the rest.
 
-    Those at whose tips three arms meet, one of them along the pin, and those parallel to an arm of the nearest tee, where they are few.
+    Those at whose tips three arms meet, one of them along the pin, those that begin at one place, and those parallel to an arm of the
+    nearest tee, where they are few.
     """
     pin = np.array([len(f.angles) == 1 for f in needles], bool)
+    tip, half = np.array([f.position_px for f in needles]).reshape(-1, 2), np.array([f.shape.half_width_px for f in needles])
+    together = pin & pin[:, None] & (gaps(tip, tip) < half + half[:, None])
+    out = together.sum(axis=1) > 1  # a pin is at its own place
     tees = [f for f, single in zip(needles, pin, strict=True) if not single]
     place = np.array([t.position_px for t in tees]).reshape(-1, 2)
     few = 0 < np.count_nonzero(pin) * _FEW_PINS <= len(tees)
-    out = np.zeros(len(needles), bool)
     for k in np.flatnonzero(pin):
-        tip, angle = needles[k].position_px, needles[k].angles[0]
-        near = junctions[np.hypot(*(junctions[:, :2] - tip).T) < _AT_TIP * needles[k].shape.length_px]
+        angle = needles[k].angles[0]
+        near = junctions[np.hypot(*(junctions[:, :2] - tip[k]).T) < _AT_TIP * needles[k].shape.length_px]
         arms = (near[:, 2, None] + [0.0, np.pi / 2, -np.pi / 2]).ravel()
         if few:
-            arms = np.append(arms, tees[int(np.hypot(*(place - tip).T).argmin())].angles)
-        out[k] = np.abs(wrapped(arms - angle)).min(initial=np.inf) < _PARALLEL
+            arms = np.append(arms, tees[int(np.hypot(*(place - tip[k]).T).argmin())].angles)
+        out[k] |= np.abs(wrapped(arms - angle)).min(initial=np.inf) < _PARALLEL
     return out
 
 
