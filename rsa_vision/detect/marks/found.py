@@ -318,7 +318,7 @@ def _measured(
         noise, under = curve, 1.0
     bent, under_one_curve = under_curve(film, known, found.edged, clear, _undisturbed(found, optics), optics, noise, painted)
     found = replace(found, fits=bent, edged=found.edged & ~under_one_curve)
-    balls, ratio, besides, covered = settle(film, found, around.places, under, free, beside, optics, noise)
+    balls, ratio, besides, covered, pulled = settle(film, found, around.places, under, free, beside, optics, noise)
     balls, added = _by_lines(Marks(film, balls, others, painted, optics, noise), clear, around.places, under)
     added[: len(besides)] += besides[:, None, None] * np.eye(2)
     if painted is not None:  # one shadow takes from what the other has left, and what a tee's arm shows of itself is the ball's as well
@@ -332,7 +332,7 @@ def _measured(
     ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
     keep &= ~(poor & ends)
     poor[lone] |= are_not_round(film, single, lambda i, *at: beside(int(lone[i]), *at), optics, noise)
-    touching = touching | ends  # something as high as itself beside it, which a ball on the end of a bar has as well
+    touching = touching | ends | pulled  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, touching, poor, rowed = balls.rows(keep), ratio[keep], touching[keep], poor[keep], around.rowed[keep]
     added = added[np.append(keep, np.ones(len(others), bool))]
     one, other = lapping_balls(balls)

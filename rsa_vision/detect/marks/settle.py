@@ -35,7 +35,9 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Beside, beside_each
 from rsa_vision.detect.neighbours.edges import OF_SHIFT
 from rsa_vision.detect.neighbours.foreign import foreign, in_line, robust_residual
+from rsa_vision.detect.neighbours.pulls import Pulls
 from rsa_vision.detect.neighbours.specks import Specks, find_specks, how_rough
+from rsa_vision.detect.neighbours.wires import find_wires
 from rsa_vision.types import Bool, Float, Int
 
 STRUCTURE = 2.0  # variance around a ball, in units of the noise, from which there is more than noise
@@ -63,7 +65,7 @@ def settle(
     beside: Beside,
     optics: Optics,
     noise: NoiseModel,
-) -> tuple[BallFits, Float, Float, Bool]:
+) -> tuple[BallFits, Float, Float, Bool, Bool]:
     """Fit the centres of balls once more.
 
     Parameters
@@ -92,10 +94,12 @@ def settle(
         :func:`rsa_vision.detect.balls.usual.size_unlike`, and of those in saturated film.
     covered : ndarray of bool, shape (n,)
         Something else lies on nearly all of it.
+    pulled : ndarray of bool, shape (n,)
+        A wire would move it by more than its error.
     """
     balls, edged, drawn = found.fits, found.edged, found.drawn
     if len(balls.depth) == 0:
-        return balls, np.ones(0), np.zeros(0), np.zeros(0, bool)
+        return balls, np.ones(0), np.zeros(0), *np.zeros((2, 0), bool)
     around = texture(places, len(free), noise)
     structure = np.where(free[:, None], around.structure, 0.0)
     alone, level = free & ~edged & ~drawn & (balls.chi2_ring < EDGE), mean_beside(places, len(free))
@@ -109,7 +113,7 @@ def settle(
     of_depth = proportion(balls.depth[told], balls.background[told], level[told], balls.background)
     fit = partial(_fitted, film, found, places, free, beside, structure, usual, of_depth)
     last = fit(alike, by_spot)
-    if any(specks.found.any() for specks in last.specks):  # or noise, of which there may be more under balls
+    if any(specks.pulls.found.any() for specks in last.specks):  # or noise, of which there may be more under balls
         alike, by_spot = (replace(common, rough=how_rough(last.specks)) for common in (alike, by_spot))
         last = fit(alike, by_spot)
     ratio = around_each(last.ratios, places, len(free), _least(noise), _QUARTILE)[:, 0]
@@ -121,7 +125,7 @@ def settle(
     besides = last.by_light
     for kind, usual_ones in ((edged & ~drawn, clear), (edged & drawn, clear_drawn)):
         besides[kind] += size_unlike(balls.rows(kind), usual_ones)
-    return out, ratio, besides, last.covered > MOST_COVERED
+    return out, ratio, besides, last.covered > MOST_COVERED, last.pulled
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +135,7 @@ class _Fitted:
     balls: BallFits
     ratios: list[Float]  # of squared errors at the places, (k, 1) for each size
     covered: Float  # (n,), part of a ball on which something else lies
+    pulled: Bool  # (n,), moved by a wire, by more than their errors
     by_light: Float  # (n,), variance of those in saturated film
     left: list[Left]  # by clear balls
     specks: list[Specks]
@@ -153,7 +158,8 @@ def _fitted(
     clear = balls.rows((balls.explained > CLOSE) & (balls.hidden == 0))
     curve = told_by(clear.background, clear.depth, clear.radius_px, curve)
     out, ratios, (covered, by_light) = replace(balls, covariance=under * balls.covariance), [], np.zeros((2, len(free)))
-    left, every, louder, stayed = list[Left](), list[Specks](), list[Float](), np.ones(len(free), bool)
+    left, every, louder = list[Left](), list[Specks](), list[Float]()
+    stayed, pulled = np.ones(len(free), bool), np.zeros(len(free), bool)
     for these in places:
         known, errors = modes(these.half, noise), np.zeros((len(these.near), 1))
         for batch, common in _batches(drawn[these.balls], alike, by_spot):
@@ -162,9 +168,13 @@ def _fitted(
             windows = _without_others(windows, edged[part], common)
             solution = solve(windows, known, structure[part], common)
             excess = np.maximum(under * np.maximum(windows.fits.chi2_ring, 1.0), usual)
-            specks = find_specks(solution, solution.radius_px + common.rim_px, windows.fits.depth, excess, 2 * these.half + 1, common)
+            rim_px = solution.radius_px + common.rim_px
+            specks = find_specks(solution, rim_px, windows.fits.depth, excess, 2 * these.half + 1, common)
+            wires = find_wires(solution, ~edged[part], rim_px, excess, 2 * these.half + 1, common)
+            pulls = specks.pulls.but(wires)
             every.append(specks)
-            fits = _fits(windows, solution, specks, known, common)
+            fits = _fits(windows, solution, pulls, known, common)
+            pulled[part] = free[part] & wires.found & (chi2(wires.shift_px, fits.covariance[:, :2, :2]) > 1)
             better = (balls.chi2_uneven[part] - fits.chi2_uneven) / noise.scatter(fits.n_core)
             covered[part], by_light[part] = windows.covered, _by_light(windows, solution, curve)
             crossed, apart = (windows.covered > 0) & (windows.covered <= MOST_COVERED), fits.position_px - balls.position_px[part]
@@ -190,7 +200,7 @@ def _fitted(
             described = (fits.chi2_ring < _UNEVEN) & (fits.chi2_core < _DESCRIBED)
             clear_ones = np.flatnonzero(moved & described & (fits.valid_fraction > _WHOLE))
             if common.spot is None and len(clear_ones) and sum(len(of.found) for of in left) < ENOUGH:
-                of = fits.background[clear_ones], specks.found[clear_ones]
+                of = fits.background[clear_ones], pulls.found[clear_ones]
                 left.append(left_over(solution, clear_ones, *of, known, these.half, common))
             both[~crossed] = 0.0
             stay = free[part] & ~moved
@@ -201,7 +211,7 @@ def _fitted(
         ratios.append(errors)
     if louder:
         out.covariance[stayed] *= np.median(np.concatenate(louder))
-    return _Fitted(out, ratios, covered, by_light, left, every)
+    return _Fitted(out, ratios, covered, pulled, by_light, left, every)
 
 
 def _batches(drawn: Bool, alike: Common, by_spot: Common) -> Iterator[tuple[Int, Common]]:
@@ -256,7 +266,7 @@ def _without_others(windows: Windows, edged: Bool, common: Common) -> Windows:
     return replace(windows, valid=valid, covered=covered)
 
 
-def _fits(windows: Windows, found: Solution, specks: Specks, known: Modes, common: Common) -> BallFits:
+def _fits(windows: Windows, found: Solution, pulls: Pulls, known: Modes, common: Common) -> BallFits:
     """Put centres, their covariances and what is left into a table."""
     fits, side, estimator = windows.fits, 2 * windows.half + 1, found.estimator
     at_ease = common.noise.variance_at(fits.background)[:, None]
@@ -270,11 +280,11 @@ def _fits(windows: Windows, found: Solution, specks: Specks, known: Modes, commo
         # what holding the radius at the usual one does where it is not, and what a wrong proportion does
         + _by(found.inverse[:, :2, 2:3] * found.held[:, None, None], every * common.size.radius_sd_px**2)
         + _by_depth(windows, found)
-        + specks.covariance
-        + OF_SHIFT * specks.shift_px[:, :, None] * specks.shift_px[:, None]
+        + pulls.covariance
+        + OF_SHIFT * pulls.shift_px[:, :, None] * pulls.shift_px[:, None]
     )
     rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1)
-    local, residual = found.local_px + specks.shift_px, found.residual - specks.image
+    local, residual = found.local_px + pulls.shift_px, found.residual - pulls.image
     distance = np.hypot(cols - local[:, :1], rows - local[:, 1:])
     core = distance < (found.radius_px + common.rim_px)[:, None]
     under, ring = (uneven_white(residual, found.weight, local, side, where, common.noise) for where in (core, ~core))

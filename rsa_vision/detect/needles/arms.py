@@ -33,7 +33,7 @@ def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
     pin = np.array([len(f.angles) == 1 for f in needles], bool)
     tip, half = np.array([f.position_px for f in needles]).reshape(-1, 2), np.array([f.shape.half_width_px for f in needles])
     together = pin & pin[:, None] & (gaps(tip, tip) < half + half[:, None])
-    out = together.sum(axis=1) > 1  # a pin is at its own place
+    out = np.asarray(together.sum(axis=1) > 1)  # a pin is at its own place
     tees = [f for f, single in zip(needles, pin, strict=True) if not single]
     place = np.array([t.position_px for t in tees]).reshape(-1, 2)
     few = 0 < np.count_nonzero(pin) * _FEW_PINS <= len(tees)

@@ -16,7 +16,8 @@ from rsa_vision.detect.balls.fits import mirrored
 from rsa_vision.detect.balls.random_effects import Common, Solution
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.whitening import whiten, whiten_rows
-from rsa_vision.types import Bool, Float
+from rsa_vision.detect.neighbours.pulls import Pulls, no_pulls
+from rsa_vision.types import Float
 
 _SPREADS_PX: Final = (1.0, 1.6)  # of dust as scanners draw it; half as much and twice as much are found as well
 _REACH: Final = 4.0  # such spreads
@@ -31,31 +32,19 @@ _NOTHING: Final = 1e-30
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Specks:
-    """What specks do to the centres of some balls.
+    """Those on some balls, at most one on each.
 
     Attributes
     ----------
-    shift_px : ndarray of shape (n, 2)
-        To be added to the centres; 0 where there is no speck.
-    covariance : ndarray of shape (n, 2, 2)
-        Of that.
-    image : ndarray of shape (n, pixels)
-        To be taken from what is left of the windows.
+    pulls : Pulls
     energy, kept : ndarray of shape (n,)
         Variance that specks have at the places of a ball, in units of that by noise as stated which has not been through the fit, and the
         part of it that fits leave, where it was calculated; else NaN.
     """
 
-    shift_px: Float
-    covariance: Float
-    image: Float
+    pulls: Pulls
     energy: Float
     kept: Float
-
-    @property
-    def found(self) -> Bool:
-        """Say on which balls there are specks, shape (n,)."""
-        return np.asarray(self.shift_px.any(axis=1))
 
 
 def how_rough(specks: list[Specks]) -> float:
@@ -84,7 +73,7 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
     Specks
     """
     (count, pixels), noise = solution.residual.shape, common.noise
-    out = Specks(np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros((count, pixels)), np.zeros(count), np.full(count, np.nan))
+    out = Specks(no_pulls(solution), np.zeros(count), np.full(count, np.nan))
     root, seen = np.sqrt(solution.weight), solution.weight > 0
     rows, cols = np.mgrid[0:side, 0:side].reshape(2, -1)
     opposite = mirrored(solution.local_px, side)
@@ -121,9 +110,8 @@ def find_specks(solution: Solution, rim_px: Float, depth: Float, excess: Float, 
             best[i] = score[k]
             spots = np.zeros((1, pixels))
             spots[0, place[k]], spots[0, across[k]] = 1.0, -1.0
-            out.shift_px[i] = -height[k] * fitted[:2, k]
-            out.covariance[i] = by_noise[i] / own[k] * np.outer(fitted[:2, k], fitted[:2, k])
-            out.image[i] = height[k] * (_at_every_place(spots, side, spread_px)[0] - fitted[:, k] @ solution.images[i])
+            both_specks = _at_every_place(spots, side, spread_px)[0]
+            out.pulls.put(int(i), solution, both_specks, fitted[:, k], float(height[k]), float(by_noise[i] / own[k]))
     return out
 
 
