@@ -79,4 +79,4 @@ def test_images_are_seen_at_pixels_in_any_order() -> None:
     ball = ball_at(30.0, 30.0)
     cols, rows = np.array([20.0, 30.0, 20.0]), np.array([20.0, 30.0, 21.0])
     shown, _ = images_beside(ball, np.arange(0), OPTICS, None, cols, rows)
-    assert shown[1] == -1000 * ball_image(np.zeros((1, 1)), np.zeros((1, 1)), np.array([4.0]), OPTICS.sigma_px, OPTICS.mu_px)[0, 0]
+    assert shown[1] == -1000 * ball_image(np.zeros((1, 1)), np.zeros((1, 1)), np.array([4.0]), OPTICS)[0, 0]

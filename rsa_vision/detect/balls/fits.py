@@ -103,7 +103,7 @@ def half_size(radius_px: float, sigma_px: float) -> int:
     return int(np.ceil(1.9 * radius_px + 3.0 * sigma_px + 2.0))
 
 
-def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, sigma_px: float, mu_px: float) -> Float:
+def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, optics: Optics) -> Float:
     """Return the blurred opacity (0..1) of balls at these distances from their centres.
 
     Parameters
@@ -111,15 +111,13 @@ def ball_image(film_dx: Float, film_dy: Float, radius_px: Float, sigma_px: float
     film_dx, film_dy : ndarray of shape (n, ...)
         Offsets of the pixels from the centres.
     radius_px : ndarray of shape (n,)
-    sigma_px, mu_px : float
-        Blur and attenuation.
+    optics : Optics
 
     Returns
     -------
     ndarray of shape (n, ...)
     """
-    table = ball_table(sigma_px, mu_px)
-    return table.evaluate(np.hypot(film_dx, film_dy) / sigma_px, radius_px / sigma_px)[0]
+    return ball_table(optics).evaluate(np.hypot(film_dx, film_dy) / optics.sigma_px, radius_px / optics.sigma_px)[0]
 
 
 def fit_balls(
@@ -159,11 +157,11 @@ def fit_balls(
     -------
     BallFits
     """
-    sigma_px, mu_px = optics.sigma_px, optics.mu_px
+    sigma_px = optics.sigma_px
     stride = max(patches.size // _SPARSE_PX, 1) if sparse else 1
     n, size = len(start_px), patches.size
     half = size // 2
-    table = ball_table(sigma_px, mu_px)
+    table = ball_table(optics)
     pixels = pixels_of(size, stride)
     values = patches.values.reshape(n, -1)
     level = values.mean(1)[:, None]
@@ -330,14 +328,14 @@ def slopes(table: BallTable, dx: Float, dy: Float, radius: Float, sigma_px: floa
     return value, slope * dx, slope * dy, slope_r / kind(sigma_px)
 
 
-def derivatives(radius: Float, half: int, sigma_px: float, mu_px: float) -> Float:
+def derivatives(radius: Float, half: int, optics: Optics) -> Float:
     """Return what windows of ``2 half + 1`` pixels around balls of depth one say of them.
 
     Parameters
     ----------
     radius : ndarray of shape (n,)
     half : int
-    sigma_px, mu_px : float
+    optics : Optics
 
     Returns
     -------
@@ -347,7 +345,7 @@ def derivatives(radius: Float, half: int, sigma_px: float, mu_px: float) -> Floa
     rows, cols = (
         np.repeat(axis.reshape(1, -1), len(radius), 0) for axis in np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
     )
-    value, *by = slopes(ball_table(sigma_px, mu_px), cols, rows, radius, sigma_px)
+    value, *by = slopes(ball_table(optics), cols, rows, radius, optics.sigma_px)
     surface = polynomial(half, cols[0], rows[0]).T
     return np.concatenate([np.stack([*by, value], axis=1), np.broadcast_to(surface, (len(radius), *surface.shape))], axis=1)
 

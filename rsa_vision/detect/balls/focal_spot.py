@@ -47,7 +47,7 @@ def shapes_of(optics: Optics, spot: Spot | None, dx: Float, dy: Float, radius: F
     -------
     value, by_dx, by_dy, by_radius : ndarrays of shape (n, p)
     """
-    table = ball_table(optics.sigma_px, optics.mu_px)
+    table = ball_table(optics)
     if spot is None:
         return slopes(table, dx, dy, radius, optics.sigma_px)
     total = np.zeros((4, *dx.shape))

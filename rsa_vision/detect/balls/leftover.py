@@ -84,7 +84,7 @@ def _told_by(film: NDArray[Any], sure: BallFits, seeds: BallFits, guess: Optics,
     patches = cut(film, fits.position_px, half, noise)
     rows, cols = np.mgrid[0 : patches.size, 0 : patches.size].reshape(2, 1, -1)
     local = fits.position_px - patches.corner_px
-    image = fits.depth[:, None] * ball_image(cols - local[:, :1], rows - local[:, 1:], fits.radius_px, guess.sigma_px, guess.mu_px)
+    image = fits.depth[:, None] * ball_image(cols - local[:, :1], rows - local[:, 1:], fits.radius_px, guess)
     left, model = patches.values.reshape(image.shape) - image, fits.background[:, None] + image
 
     def under(trial: NoiseModel) -> float:
@@ -215,7 +215,7 @@ def usual_square(squares: Float) -> float:
 def _uneven(places: Places, radius_px: float, quiet: float, optics: Optics, noise: NoiseModel) -> Float:
     """Mean squares of the odd part of what the fit of a ball leaves of quiet places, under where the ball would be."""
     half = places.half
-    basis = np.linalg.qr(derivatives(np.array([radius_px]), half, optics.sigma_px, optics.mu_px)[0].T)[0]
+    basis = np.linalg.qr(derivatives(np.array([radius_px]), half, optics)[0].T)[0]
     level = places.values.mean(axis=1, keepdims=True)
     values = (places.values - level) / np.sqrt(noise.variance_at(level))
     rest = values - (values @ basis) @ basis.T

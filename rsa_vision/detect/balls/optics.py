@@ -203,11 +203,10 @@ def _equations(film: NDArray[Any], fits: BallFits, first: BallFits, halves: Floa
         patches = cut(film, first.position_px[index], int(half), noise)
         rows, cols = np.mgrid[0 : patches.size, 0 : patches.size].reshape(2, 1, -1).astype(np.float64)
         dx, dy = (axis - at[:, None] for axis, at in zip((cols, rows), (one.position_px - patches.corner_px).T, strict=True))
-        sides = [
-            ball_image(dx, dy, one.radius_px, s, m) for s, m in ((sigma * h, mu / h), (sigma / h, mu * h), (sigma, mu * h), (sigma, mu / h))
-        ]
+        either = (Optics(sigma * h, mu / h), Optics(sigma / h, mu * h), Optics(sigma, mu * h), Optics(sigma, mu / h))
+        sides = [ball_image(dx, dy, one.radius_px, of) for of in either]
         shared = np.stack([sides[0] - sides[1], sides[2] - sides[3]], 1) / (2 * _STEP)
-        value, by_dx, by_dy, by_radius = slopes(ball_table(sigma, mu), dx, dy, one.radius_px, sigma)
+        value, by_dx, by_dy, by_radius = slopes(ball_table(optics), dx, dy, one.radius_px, sigma)
         surface = polynomial(half, cols[0] - half, rows[0] - half).T
         depth, background = one.depth[:, None], one.background[:, None]
         of_ball = np.stack([value, depth * by_dx, depth * by_dy, depth * by_radius], 1)

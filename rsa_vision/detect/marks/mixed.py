@@ -113,7 +113,7 @@ def _joint_covariance(
 
     def image(x: float, y: float, radius: float) -> Float:
         at = ((cols - x)[None], (rows - y)[None])
-        value: Float = ball_image(*at, np.array([radius]), optics.sigma_px, optics.mu_px)[0]
+        value: Float = ball_image(*at, np.array([radius]), optics)[0]
         return value
 
     h = _STEP_PX

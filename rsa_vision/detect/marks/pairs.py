@@ -112,13 +112,13 @@ def _as_two(
     fits = []
     for stretch in stretches:
         starts = blob.position_px + np.array([[-0.5], [0.5]]) * stretch * axis
-        fits.append(fit_group(film, starts, radius, sigma_px, KAPPA / sigma_px, noise, steps=steps))
+        fits.append(fit_group(film, starts, radius, Optics(sigma_px, KAPPA / sigma_px), noise, steps=steps))
     return min(fits, key=lambda pair: float(pair.chi2_core.mean()))
 
 
 def _left(window: GroupWindow, pair: BallFits, sigma_px: float, noise: NoiseModel) -> float:
     """Minus twice the log-likelihood, were the variance unknown, on the same pixels at all blurs."""
-    images = images_in(window, window.surface, pair.position_px - window.corner_px, pair.radius_px, sigma_px, KAPPA / sigma_px)
+    images = images_in(window, window.surface, pair.position_px - window.corner_px, pair.radius_px, Optics(sigma_px, KAPPA / sigma_px))
     rest, weight = window.left_by(images.linear, noise)
     return float(window.valid.sum() * np.log(np.maximum(weight @ rest**2, 1e-12)))
 

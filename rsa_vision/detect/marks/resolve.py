@@ -133,11 +133,11 @@ def resolve_balls(
     sized = bool(np.count_nonzero(clear) >= LEAST_KNOWN)
     like = good.rows(clear) if sized else good
     for members in unexplained_pairs(film, candidates, good, like, sized, optics, beside):
-        pair = fit_group(film, members[:, :2], members[:, 2], optics.sigma_px, optics.mu_px, noise, beside)
+        pair = fit_group(film, members[:, :2], members[:, 2], optics, noise, beside)
         # one peak too many takes part of a ball, and then there is none
         while sized and len(pair.depth) > 2 and not _like(pair, like).all():
             others_px = pair.rows(np.arange(len(pair.depth)) != pair.significance.argmin()).position_px
-            fewer = fit_group(film, others_px, np.full(len(others_px), members[0, 2]), optics.sigma_px, optics.mu_px, noise, beside)
+            fewer = fit_group(film, others_px, np.full(len(others_px), members[0, 2]), optics, noise, beside)
             if np.count_nonzero(plausible(pair, noise)) < 2 and not (_like(fewer, like) & plausible(fewer, noise)).all():
                 break
             pair = fewer
@@ -163,7 +163,7 @@ def resolve_balls(
         index = np.array(g)
         if 1 < len(g) <= MOST_IN_GROUP:
             near = all_but(known, index, optics, beside)
-            group = fit_group(film, good.position_px[index], good.radius_px[index], optics.sigma_px, optics.mu_px, noise, near)
+            group = fit_group(film, good.position_px[index], good.radius_px[index], optics, noise, near)
             tells = (plausible(group, noise) & ~_cancelled(group)).any()
             if not tells and (one := _one_for_all(good, index, noise)):
                 there[index] = np.isin(index, one)

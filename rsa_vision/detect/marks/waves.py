@@ -32,6 +32,6 @@ def like_waves(images: MarkerImages, height: float, optics: Optics) -> MarkerIma
     if height == 0.0 or not len(images):
         return images
     middle = np.zeros((len(images), 1))
-    seen = ball_image(middle, middle, np.clip(images.radius_px, *RADIUS_PX), optics.sigma_px, optics.mu_px)[:, 0]
+    seen = ball_image(middle, middle, np.clip(images.radius_px, *RADIUS_PX), optics)[:, 0]
     low = images.contrast * seen < _SEVERAL * height
     return replace(images, flags=images.flags | np.where(low, MarkerFlag.UNLIKE, 0))

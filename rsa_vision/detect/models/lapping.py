@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from rsa_vision.detect.film.places import gaps
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float
 
 FINE = 3  # samples along a pixel
@@ -47,7 +48,7 @@ def _opacities(x: Float, y: Float, balls: Float, mu_px: float) -> Float:
     return opaque
 
 
-def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, size: int) -> tuple[Float, Float]:
+def product_image(local: Float, radius: Float, optics: Optics, size: int) -> tuple[Float, Float]:
     """Return the blurred product of the opacities of two balls.
 
     Parameters
@@ -56,7 +57,7 @@ def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, si
         (col, row) in the window.
     radius : ndarray of shape (2,)
         Pixels.
-    sigma_px, mu_px : float
+    optics : Optics
     size : int
         Side of the window.
 
@@ -72,7 +73,7 @@ def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, si
     gap = float(np.hypot(*apart))
     way = apart / max(gap, 1e-9)
     middle = local[0] + way * (gap + radius[0] - radius[1]) / 2
-    reach = int(np.ceil(float(radius.min()) + _BLURS * sigma_px)) + 1
+    reach = int(np.ceil(float(radius.min()) + _BLURS * optics.sigma_px)) + 1
     first = np.maximum(np.rint(middle).astype(int) - reach, 0)
     last = np.minimum(np.rint(middle).astype(int) + reach + 1, size)
     value, slopes = np.zeros((size, size)), np.zeros((2, 3, size, size))
@@ -88,12 +89,12 @@ def product_image(local: Float, radius: Float, sigma_px: float, mu_px: float, si
     ]
     x, y = fine[0][both[0]], fine[1][both[1]]
     at = np.stack([np.zeros(3), *_EITHER_WAY]) + np.append(apart, radius[1])
-    one, larger, smaller = _opacities(x, y, np.array([[0.0, 0.0, radius[0] + step] for step in (0.0, _STEP_PX, -_STEP_PX)]), mu_px)
-    two, *moved = _opacities(x, y, at, mu_px)
+    one, larger, smaller = _opacities(x, y, np.array([[0.0, 0.0, radius[0] + step] for step in (0.0, _STEP_PX, -_STEP_PX)]), optics.mu_px)
+    two, *moved = _opacities(x, y, at, optics.mu_px)
     # of the second ball's moves, and of either radius: blurring is linear, so differences are taken first
     by_sharp = [one * (more - less) for more, less in zip(moved[:3], moved[3:], strict=True)]
     by_sharp.append((larger - smaller) * two)
-    across, down = ([m[:, part] for m in _blur_to_pixels(int(n), sigma_px)] for n, part in zip(lengths, both, strict=True))
+    across, down = ([m[:, part] for m in _blur_to_pixels(int(n), optics.sigma_px)] for n, part in zip(lengths, both, strict=True))
     seen = down[0] @ (one * two) @ across[0].T
     by_row, by_col = down[1] @ (one * two) @ across[0].T, down[0] @ (one * two) @ across[1].T
     by_two_x, by_two_y, by_two_r, by_one_r = down[0] @ (np.array(by_sharp) / (2 * _STEP_PX)) @ across[0].T
@@ -109,7 +110,7 @@ def fine_places(size: int) -> Float:
     return (np.arange((size + 4) * FINE) + 0.5) / FINE - 2.5
 
 
-def product_with(other: Float, local: Float, radius: float, sigma_px: float, mu_px: float) -> tuple[Float, Float]:
+def product_with(other: Float, local: Float, radius: float, optics: Optics) -> tuple[Float, Float]:
     """Return the blurred product of the opacity of a ball and of anything else.
 
     Parameters
@@ -120,7 +121,7 @@ def product_with(other: Float, local: Float, radius: float, sigma_px: float, mu_
         (col, row) of the ball in the window.
     radius : float
         Pixels.
-    sigma_px, mu_px : float
+    optics : Optics
 
     Returns
     -------
@@ -133,8 +134,8 @@ def product_with(other: Float, local: Float, radius: float, sigma_px: float, mu_
     at = fine_places(size)
     cols, rows = (np.flatnonzero(np.abs(at - middle) < radius + _ROOM_PX) for middle in local)
     ball = np.append(np.zeros(2), radius)
-    one, *moved = _opacities(at[cols] - local[0], at[rows] - local[1], ball + np.concatenate([np.zeros((1, 3)), _EITHER_WAY]), mu_px)
+    one, *moved = _opacities(at[cols] - local[0], at[rows] - local[1], ball + np.concatenate([np.zeros((1, 3)), _EITHER_WAY]), optics.mu_px)
     sharp = np.array([one, *((more - less) / (2 * _STEP_PX) for more, less in zip(moved[:3], moved[3:], strict=True))])
-    blur = _blur_to_pixels(len(at), sigma_px)[0]
+    blur = _blur_to_pixels(len(at), optics.sigma_px)[0]
     value, *slopes = (blur[:, rows] @ (sharp * other[np.ix_(rows, cols)]) @ blur[:, cols].T).reshape(4, -1)
     return value, np.array(slopes)

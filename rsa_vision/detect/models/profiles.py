@@ -136,21 +136,18 @@ class BallTable:
             self.made[block] = True
 
 
-def ball_table(sigma_px: float, mu_px: float) -> BallTable:
-    """Return the table of balls of this blur and attenuation, which those of about as much attenuation along one blur width share.
+def ball_table(optics: Optics) -> BallTable:
+    """Return the table of balls on a film, which those of about as much attenuation along one blur width share.
 
     Parameters
     ----------
-    sigma_px : float
-        Blur.
-    mu_px : float
-        Attenuation per pixel of chord.
+    optics : Optics
 
     Returns
     -------
     BallTable
     """
-    return _table(round(mu_px * sigma_px, 3))
+    return _table(round(optics.mu_px * optics.sigma_px, 3))
 
 
 @lru_cache(maxsize=12)  # a fit asks for seven

@@ -56,7 +56,7 @@ def images_beside(known: BallFits, members: Int, optics: Optics, needles: Images
     near[members] = False
     for j in np.nonzero(near)[0]:
         dx, dy = cols - known.position_px[j, 0], rows - known.position_px[j, 1]
-        image = ball_image(dx.reshape(1, -1), dy.reshape(1, -1), known.radius_px[[j]], optics.sigma_px, optics.mu_px)
+        image = ball_image(dx.reshape(1, -1), dy.reshape(1, -1), known.radius_px[[j]], optics)
         total = total + known.depth[j] * image.reshape(cols.shape)
         doubtful = doubtful | (np.hypot(dx, dy) < known.radius_px[j] + optics.sigma_px)
     return total, doubtful
@@ -70,7 +70,7 @@ def take_balls(box: Box, balls: BallFits, optics: Optics) -> None:
         (left, top), (right, bottom) = (np.clip(np.rint(at + step), 0, size).astype(np.intp) for step in (-reach, reach + 1))
         if left < right and top < bottom:
             dx, dy = np.meshgrid(np.arange(left, right) - at[0], np.arange(top, bottom) - at[1])
-            film[top:bottom, left:right] -= depth * ball_image(dx[None], dy[None], np.array([radius]), optics.sigma_px, optics.mu_px)[0]
+            film[top:bottom, left:right] -= depth * ball_image(dx[None], dy[None], np.array([radius]), optics)[0]
 
 
 def deep_at(film: NDArray[Any], peaks: Float, radius: float, needles: Images | None) -> Float:

@@ -79,14 +79,14 @@ def split_blobs(
             continue
         tried += 1
         others = beside()
-        whole = fit_group(film, place[None], blobs.radius_px[[i]], optics.sigma_px, optics.mu_px, noise, others)
+        whole = fit_group(film, place[None], blobs.radius_px[[i]], optics, noise, others)
         least = LEAST_GAIN * of_length / float(whole.n_core[0])
         if whole.chi2_core[0] <= least:
             continue  # even two that left nothing would not be better by enough
         axis = long_axis(film, whole, np.sign(blobs.depth[i]))
         for offsets, radius in _starts(sizes):
             starts = whole.position_px + offsets[:, None] * axis
-            pair = fit_group(film, starts, radius, optics.sigma_px, optics.mu_px, noise, others)
+            pair = fit_group(film, starts, radius, optics, noise, others)
             if _two(pair, whole, sizes, least, noise):
                 out.append(pair)
                 break

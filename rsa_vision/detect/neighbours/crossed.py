@@ -54,7 +54,7 @@ def _masked(film: NDArray[Any], ball: BallFits, optics: Optics, noise: NoiseMode
     """Fit a ball once without what is foreign; none where that is as broad as the ball: bars and letters leave such rests."""
     window = window_around(film, ball.position_px, ball.radius_px, optics.sigma_px, noise, others)
     local = ball.position_px - window.corner_px
-    images = images_in(window, window.surface, local, ball.radius_px, optics.sigma_px, optics.mu_px)
+    images = images_in(window, window.surface, local, ball.radius_px, optics)
     parts = np.concatenate([images.value, ball.depth[0] * images.slopes[:, 0], window.surface.T])[None]
     weight = window.valid / noise.variance_at(window.raw)
     data = window.raw - window.neighbours

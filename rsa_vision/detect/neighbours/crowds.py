@@ -101,7 +101,7 @@ def _joined(film: NDArray[Any], found: BallFits, crowd: BallFits, optics: Optics
     if near.any():
         start = join([found.rows(near), crowd])
         others = all_but(found, np.flatnonzero(near), optics, needles)
-        crowd = fit_group(film, start.position_px, start.radius_px, optics.sigma_px, optics.mu_px, noise, others)
+        crowd = fit_group(film, start.position_px, start.radius_px, optics, noise, others)
         if not (plausible(crowd, noise) & (misfit(crowd, noise) < DOUBTFUL * MISFIT)).all():
             return found
     return join([found.rows(~near), crowd])
@@ -112,7 +112,7 @@ def _crowd(film: NDArray[Any], blob: BallFits, known: BallFits, optics: Optics, 
     radius, sign = float(np.median(known.radius_px)), float(np.sign(blob.depth[0]))
 
     def fit(start: Float) -> BallFits:
-        return fit_group(film, start, np.full(len(start), radius), optics.sigma_px, optics.mu_px, noise, others)
+        return fit_group(film, start, np.full(len(start), radius), optics, noise, others)
 
     axis = long_axis(film, blob, sign)
     middle = blob.position_px
@@ -133,7 +133,7 @@ def _most_left(film: NDArray[Any], fits: BallFits, radius: float, optics: Optics
     """Place, shape (1, 2), where one more ball would explain most of what these leave."""
     window = window_around(film, fits.position_px, fits.radius_px, optics.sigma_px, noise, others)
     local = fits.position_px - window.corner_px
-    basis = images_in(window, window.surface, local, fits.radius_px, optics.sigma_px, optics.mu_px).linear
+    basis = images_in(window, window.surface, local, fits.radius_px, optics).linear
     left = window.left_by(basis, noise)[0] * window.valid * np.sign(fits.depth[0])
     smooth = gaussian_filter(left.reshape(window.size, window.size), 0.5 * radius).ravel()
     near = (np.hypot(window.cols - local[:, :1], window.rows - local[:, 1:]) < 2.5 * radius).any(axis=0)

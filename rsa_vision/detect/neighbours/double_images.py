@@ -65,11 +65,11 @@ def gain_over_two(
         start_radius = np.full(2, single.radius_px[i] if len(known.depth) == 0 else np.exp(size[0]))
         for stretch in STRETCH:
             start = single.position_px[i] + np.array([[-0.5], [0.5]]) * stretch * axis
-            two = fit_group(film, start, start_radius, optics.sigma_px, optics.mu_px, noise, needles)
+            two = fit_group(film, start, start_radius, optics, noise, needles)
             window = window_around(film, two.position_px, two.radius_px, optics.sigma_px, noise, needles)
             cols, rows = window.cols + window.corner_px[0], window.rows + window.corner_px[1]
             local = two.position_px - window.corner_px
-            of_two = images_in(window, window.surface, local, two.radius_px, optics.sigma_px, optics.mu_px).linear
+            of_two = images_in(window, window.surface, local, two.radius_px, optics).linear
             of_one = columns([images(i, cols, rows)[None], window.surface.T])
             place = np.concatenate([two.position_px, drawn.position_px[[i]]])
             reach = np.append(two.radius_px, max(drawn.radius_px[i], single.radius_px[i])) + optics.sigma_px

@@ -79,11 +79,11 @@ def balls_beside_edges(
         if len(g) > MOST_IN_GROUP or not worth[index].any() or at_limit or burnt:
             parts.append(plain)
             continue
-        foreseen = edge_gain(film, plain, optics.sigma_px, optics.mu_px, noise, beside, spot) / noise.correlation.sum()
+        foreseen = edge_gain(film, plain, optics, noise, beside, spot) / noise.correlation.sum()
         if foreseen < _FORESEEN * EDGE_GAIN:
             parts.append(plain)
             continue
-        fitted = partial(fit_group, film, plain.position_px, plain.radius_px, optics.sigma_px, optics.mu_px, noise, beside, spot=spot)
+        fitted = partial(fit_group, film, plain.position_px, plain.radius_px, optics, noise, beside, spot=spot)
         straight = fitted(edge=True)
         models = [(0.0 if straight.converged.all() else -np.inf, straight)]
         for taken, bent in ((True, False), (False, True), (True, True)):

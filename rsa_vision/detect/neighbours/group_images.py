@@ -115,19 +115,18 @@ def images_in(
     surface: Float,
     local: Float,
     radius: Float,
-    sigma_px: float,
-    mu_px: float,
+    optics: Optics,
     ground: Float | None = None,
     spot: Spot | None = None,
 ) -> GroupImages:
     """Draw balls at places (k, 2) in a window; ``ground``: what is under them and they take their part of."""
-    value, slopes = _alone(window, local, radius, sigma_px, mu_px, spot)
+    value, slopes = _alone(window, local, radius, optics, spot)
     # two exposures on one film add up, and a film curve bends the sum: how much of the product of two images is there, the film tells
     pairs: list[tuple[int, int]] = []
     products: list[Float] = []
     of_pairs: list[Float] = []
     for pair in lapping(local, radius):
-        product, by = product_image(local[list(pair)], radius[list(pair)], sigma_px, mu_px, window.size)
+        product, by = product_image(local[list(pair)], radius[list(pair)], optics, window.size)
         if product.max() > LEAST:
             pairs, products, of_pairs = [*pairs, pair], [*products, product[None]], [*of_pairs, by]
     # a mark takes away its part of what is there: on linear films more beside an implant than behind it, on films of density as much
@@ -148,12 +147,10 @@ class ImagesOver(GroupImages):
         return columns([by_shape.reshape(3 * k, -1), self.linear.T])
 
 
-def images_over(
-    other: Float, window: GroupWindow, surface: Float, local: Float, radius: Float, sigma_px: float, mu_px: float
-) -> ImagesOver:
+def images_over(other: Float, window: GroupWindow, surface: Float, local: Float, radius: Float, optics: Optics) -> ImagesOver:
     """Draw balls at places (k, 2) on something else, whose opacity (m, m) is given as of :func:`product_with`."""
-    value, slopes = _alone(window, local, radius, sigma_px, mu_px, None)
-    taken, by_taken = zip(*(product_with(other, at, float(r), sigma_px, mu_px) for at, r in zip(local, radius, strict=True)), strict=True)
+    value, slopes = _alone(window, local, radius, optics, None)
+    taken, by_taken = zip(*(product_with(other, at, float(r), optics) for at, r in zip(local, radius, strict=True)), strict=True)
     linear = columns([value, surface.T, np.array(taken)])
     return ImagesOver(value, slopes, linear, None, [], [], np.stack(by_taken, axis=1))
 
@@ -198,7 +195,7 @@ def images_under_curve(
 
     ``one_light``: they lie in one beam, and the second takes from what the first has left; those of two exposures add up.
     """
-    opacity, by = _alone(window, local, radius, optics.sigma_px, optics.mu_px, None)
+    opacity, by = _alone(window, local, radius, optics, None)
     pairs = lapping(local, radius, _BESIDE * optics.sigma_px)
     products = [_shared(window, local, radius, optics, pair, one_light=one_light) for pair in pairs]
     shown = Opacities(opacity, pairs, [product for product, _ in products])
@@ -218,18 +215,18 @@ def _shared(
     if not one_light:
         return np.zeros(len(window.cols)), np.zeros((2, 3, len(window.cols)))
     both = list(pair)
-    return product_image(local[both], radius[both], optics.sigma_px, optics.mu_px, window.size)
+    return product_image(local[both], radius[both], optics, window.size)
 
 
 def opacities_in(window: GroupWindow, local: Float, radius: Float, optics: Optics, *, one_light: bool) -> Opacities:
     """Draw balls as for :func:`images_under_curve`, without a curve and without slopes."""
-    alone, _ = _alone(window, local, radius, optics.sigma_px, optics.mu_px, None)
+    alone, _ = _alone(window, local, radius, optics, None)
     pairs = lapping(local, radius, _BESIDE * optics.sigma_px)
     return Opacities(alone, pairs, [_shared(window, local, radius, optics, pair, one_light=one_light)[0] for pair in pairs])
 
 
-def _alone(window: GroupWindow, local: Float, radius: Float, sigma_px: float, mu_px: float, spot: Spot | None) -> tuple[Float, Float]:
+def _alone(window: GroupWindow, local: Float, radius: Float, optics: Optics, spot: Spot | None) -> tuple[Float, Float]:
     """Images (k, n) of single balls, and their slopes by col, row and radius (3, k, n)."""
     dx, dy = window.cols - local[:, :1], window.rows - local[:, 1:]
-    value, by_dx, by_dy, by_radius = shapes_of(Optics(sigma_px, mu_px), spot, dx, dy, radius)
+    value, by_dx, by_dy, by_radius = shapes_of(optics, spot, dx, dy, radius)
     return value, np.stack([-by_dx, -by_dy, by_radius])

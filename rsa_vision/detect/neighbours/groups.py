@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from rsa_vision.detect.film.least_squares import columns, damped_solution, inver
 from rsa_vision.detect.film.noise import NoiseModel, influence_covariance
 from rsa_vision.detect.film.progress import WEIGHED, in_vain
 from rsa_vision.detect.film.whitening import whiten_rows
+from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.group_images import GroupImages, GroupWindow, images_in, window_around
 from rsa_vision.types import Float
@@ -32,8 +34,7 @@ def fit_group(
     film: NDArray[Any],
     start_px: Float,
     start_radius_px: Float,
-    sigma_px: float,
-    mu_px: float,
+    optics: Optics,
     noise: NoiseModel,
     others: Images | None = None,
     *,
@@ -53,7 +54,7 @@ def fit_group(
     start_px : ndarray of shape (k, 2)
         (col, row).
     start_radius_px : ndarray of shape (k,)
-    sigma_px, mu_px : float
+    optics : Optics
     noise : NoiseModel
     others : callable, optional
         ``others(cols, rows)``: images of neighbours outside the group, subtracted first.
@@ -79,9 +80,10 @@ def fit_group(
         (``valid_fraction`` 0).
     """
     k = len(start_px)
-    window = window_around(film, start_px, start_radius_px, sigma_px, noise, others)
+    window = window_around(film, start_px, start_radius_px, optics.sigma_px, noise, others)
     size, cols, rows, valid, data = window.size, window.cols, window.rows, window.valid, window.raw - window.neighbours
-    sigma_px *= float(np.exp(blurrier))
+    optics = replace(optics, sigma_px=optics.sigma_px * float(np.exp(blurrier)))
+    sigma_px = optics.sigma_px
     low, high = radii(sigma_px)
     local, radius = start_px - window.corner_px, np.clip(start_radius_px, low, high).astype(np.float64)
     surface = window.surface
@@ -91,7 +93,7 @@ def fit_group(
     def draw(local: Float, radius: Float) -> GroupImages:
         if images:
             return images(window, surface, local, radius)
-        return images_in(window, surface, local, radius, sigma_px, mu_px, ground, spot)
+        return images_in(window, surface, local, radius, optics, ground, spot)
 
     seen = draw(local, radius)
     theta = weighted_least_squares(seen.linear, weight, data, 1e-6)
@@ -183,8 +185,7 @@ def _estimator(weighted: Float, size: int, noise: NoiseModel) -> Float:
 def edge_gain(
     film: NDArray[Any],
     fits: BallFits,
-    sigma_px: float,
-    mu_px: float,
+    optics: Optics,
     noise: NoiseModel,
     others: Images | None,
     spot: Spot | None,
@@ -199,7 +200,7 @@ def edge_gain(
     film : ndarray of shape (rows, cols)
     fits : BallFits
         One group, as fitted without an edge.
-    sigma_px, mu_px : float
+    optics : Optics
     noise : NoiseModel
     others : callable, optional
     spot : Spot, optional
@@ -210,12 +211,12 @@ def edge_gain(
     float
         As if the noise were white.
     """
-    window = window_around(film, fits.position_px, fits.radius_px, sigma_px, noise, others)
+    window = window_around(film, fits.position_px, fits.radius_px, optics.sigma_px, noise, others)
     weight = window.valid / noise.variance_at(window.raw)
     data = window.raw - window.neighbours
-    images = images_in(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, sigma_px, mu_px, spot=spot)
+    images = images_in(window, window.surface, fits.position_px - window.corner_px, fits.radius_px, optics, spot=spot)
     theta = weighted_least_squares(images.linear, weight, data)
-    edge = window.edge(data - images.value.T @ theta[: len(fits.depth)], sigma_px)
+    edge = window.edge(data - images.value.T @ theta[: len(fits.depth)], optics.sigma_px)
     residual, jac = data - images.linear @ theta, columns([images.jacobian(theta).T, edge])
     weighted = jac * np.sqrt(weight)[:, None]
     normal, right = weighted.T @ weighted, jac.T @ (weight * residual)

@@ -102,14 +102,13 @@ def fit_one_over(
     shown : callable
         What it adds to the needles at pixels (cols, rows), in film values.
     """
-    sigma, mu = optics.sigma_px, optics.mu_px
     tried = [
-        (draw, fit_group(film, at_px[None], np.array([radius_px]), sigma, mu, noise, others, images=draw))
+        (draw, fit_group(film, at_px[None], np.array([radius_px]), optics, noise, others, images=draw))
         for draw in (_linear(painted, optics), _additive(painted, optics))
     ]
     (draw, ball), (_, other) = sorted(tried, key=lambda one: float(one[1].chi2_core[0]))
     apart = (ball.position_px - other.position_px)[0]
-    window = window_around(film, ball.position_px, ball.radius_px, sigma, noise, others)
+    window = window_around(film, ball.position_px, ball.radius_px, optics.sigma_px, noise, others)
     linear = draw(window, window.surface, ball.position_px - window.corner_px, ball.radius_px).linear
     theta = weighted_least_squares(linear, window.valid / noise.variance_at(window.raw), window.raw - window.neighbours)
     picture, corner = (linear[:, [0, -1]] @ theta[[0, -1]]).reshape(window.size, window.size), window.corner_px.astype(np.intp)
@@ -133,7 +132,7 @@ def _linear(painted: Painted, optics: Optics) -> Draw:
 
     def draw(window: GroupWindow, surface: Float, local: Float, radius: Float) -> GroupImages:
         other = arms(*window.corner_px.tolist(), window.size)
-        return images_over(other, window, surface, local, radius, optics.sigma_px, optics.mu_px)
+        return images_over(other, window, surface, local, radius, optics)
 
     return draw
 
@@ -144,7 +143,7 @@ def _additive(painted: Painted, optics: Optics) -> Draw:
     def draw(window: GroupWindow, surface: Float, local: Float, radius: Float) -> GroupImages:
         shown = painted(window.cols + window.corner_px[0], window.rows + window.corner_px[1])
         arms = shown / max(float(np.abs(shown).max()), 1e-9)
-        return images_in(window, surface, local, radius, optics.sigma_px, optics.mu_px, np.broadcast_to(arms, (len(radius), len(arms))))
+        return images_in(window, surface, local, radius, optics, np.broadcast_to(arms, (len(radius), len(arms))))
 
     return draw
 

@@ -62,7 +62,7 @@ def without_lines(film: NDArray[Any], fits: BallFits, limit: float, optics: Opti
     for g in groups_of(kept, optics):
         index = np.array(g)
         if again[g].any():
-            at = (kept.position_px[index], kept.radius_px[index], optics.sigma_px, optics.mu_px, noise)
+            at = (kept.position_px[index], kept.radius_px[index], optics, noise)
             parts.append(fit_group(film, *at, all_but(kept, index, optics, needles)))
     return join(parts)
 
@@ -124,7 +124,7 @@ def balls_on_lines(
     gains = [_gains(film, place_px[k : k + BATCH], radius_px, optics, noise, others) for k in range(0, len(place_px), BATCH)]
     of_ball, of_line, of_both = np.concatenate([np.zeros((0, 3)), *gains]).T
     worth = place_px[(of_line > of_ball) & (of_both - of_line > (_FAR * limit) ** 2)]
-    how = (np.array([radius_px]), optics.sigma_px, optics.mu_px, noise, others)
+    how = (np.array([radius_px]), optics, noise, others)
     return join([no_fits(), *(fit_group(film, at[None], *how, edge=True) for at in worth)])
 
 

@@ -118,7 +118,7 @@ def _larger(radius_px: Float) -> Bool:
 def _outlines(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
     """``m cos(2 phi0)`` and ``m sin(2 phi0)``, px^2, and ``e cos(4 phi0)`` and ``e sin(4 phi0)``, px (n, 4), and their covariances."""
     halves = np.array([half_size(r, optics.sigma_px) for r in balls.radius_px])
-    table = ball_table(optics.sigma_px, optics.mu_px)
+    table = ball_table(optics)
     out, covariance = np.zeros((len(halves), 4)), np.zeros((len(halves), 4, 4))
     of_one_size = [np.flatnonzero(halves == half) for half in np.unique(halves)]
     for index in (same[k : k + BATCH] for same in of_one_size for k in range(0, len(same), BATCH)):

@@ -224,7 +224,7 @@ def _equations(w: _Window, s: _State, optics: Optics, noise: NoiseModel) -> _Equ
     spot, n = spot_of(s.along), len(s.radius)
     sides = [(spot_of(s.along + h), spot_of(s.along - h)) for h in _H * np.eye(len(s.along))]
     by_points, by_weights = (np.stack([(getattr(a, f) - getattr(b, f)) / (2 * _H) for a, b in sides]) for f in ("points", "weights"))
-    table = ball_table(optics.sigma_px, optics.mu_px)
+    table = ball_table(optics)
     dx, dy = w.cols - s.local[:, :1], w.rows - s.local[:, 1:]
     by = np.zeros((4, *dx.shape))  # of the ball: value, slopes by col, row and radius
     shared = np.zeros((n, len(s.along), dx.shape[1]))

@@ -229,7 +229,7 @@ def _fit(film: NDArray[Any], fits: BallFits, curve: _State, noise: NoiseModel, o
     optics, k = _optics(curve.common), len(fits.radius_px)
     one_light = _likelier(_group(film, fits, optics, noise, others), curve.common).group.one_light
     images = partial(images_under_curve, optics=optics, one_light=one_light)
-    found = fit_group(film, fits.position_px, fits.radius_px, optics.sigma_px, optics.mu_px, noise, others, images=images)
+    found = fit_group(film, fits.position_px, fits.radius_px, optics, noise, others, images=images)
     rest = _rest(replace(_group(film, found, optics, noise, others), one_light=one_light), curve.common)
     by_common, of_common = _told(rest, curve.common).by_common, np.linalg.inv(curve.normal)
     by = by_common[np.arange(4 * k).reshape(4, k).T]
