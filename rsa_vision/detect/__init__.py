@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import significance_limit
+from rsa_vision.detect.balls.likeliest import with_bend
 from rsa_vision.detect.film.noise import NoiseModel, estimate_noise
 from rsa_vision.detect.film.wavelets import height_of_waves
 from rsa_vision.detect.marks.found import marks_of
@@ -133,6 +134,8 @@ def _detect(values: NDArray[Any], bits: int, noise: NoiseModel, limit: float, on
                 straight = _detect(other, BITS, its_noise, limit, seen.sign)
                 found += [(evidence, replace(each, images=in_film_values(each.images, bits))) for evidence, each in straight]
                 continue
+        if only is None:  # log odds are as straight as film lets them be
+            seen = replace(seen, optics=with_bend(values, seen.looks, seen.optics, seen.noise))
         images, evidence = marks_of(values, bits, seen, pins, candidates, faint, limit, mottled=mottled)
         found.append((evidence, Detection(images, seen.sign < 0, seen.optics, seen.noise)))
     return found

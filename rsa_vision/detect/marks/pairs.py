@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from rsa_vision.detect.balls.find import ANYTHING, DOUBTFUL, MISFIT, distinct, first_look, fit_at, misfit, plausible, refine
 from rsa_vision.detect.balls.fits import BallFits, join
-from rsa_vision.detect.balls.optics import KAPPA, SIGMAS_PX, ball_evidence, unexpected
+from rsa_vision.detect.balls.likeliest import unexpected
+from rsa_vision.detect.balls.optics import KAPPA, SIGMAS_PX, ball_evidence
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import for_all, nothing

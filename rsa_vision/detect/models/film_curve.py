@@ -24,6 +24,11 @@ def skewness_of_log(bend: float) -> float:
     return _OF_LOG * bend**2
 
 
+def curve_of_bend(bend: float) -> tuple[float, float]:
+    """Return the curve of one number: a logarithm where it is negative, a shift of the log odds where it is not."""
+    return bend, skewness_of_log(bend) if bend < 0 else 0.0
+
+
 def film_curve(opacity: NDArray[Any], curve: tuple[float, float]) -> Float:
     """What film shows of blurred opacities, by the two coefficients of :attr:`Optics.curve`."""
     return np.asarray(_shifted(opacity, curve[0]) + curve[1] * _skew(opacity, curve))

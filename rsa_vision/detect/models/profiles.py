@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import i0e
 
+from rsa_vision.detect.models.film_curve import curve_of_bend, film_curve
 from rsa_vision.types import Bool, Float, Int
 
 TAIL = 2.4  # times the blur, of the wider part of the light
@@ -52,6 +53,9 @@ class Optics:
     uneven : tuple of float
         Blur that differs by direction, of a focal spot that is no square or a scanner that reads lines: at the angle ``a`` its variance is
         ``1 + uneven[0] cos 2a + uneven[1] sin 2a`` times the mean one. Tips of pins and tees ask for it; it moves no centre of a ball.
+    bend : float
+        Of the film curve, as ``curve[0]``, with the skewness of a logarithm where it is negative: what single balls show of it beside
+        attenuation. Balls only.
     rough : bool
         The blur is a guess to improve upon.
     """
@@ -64,6 +68,7 @@ class Optics:
     logged: float = 0.0
     proportion: float = 0.0
     uneven: tuple[float, float] = (0.0, 0.0)
+    bend: float = 0.0
     rough: bool = False
 
     def pooled(self, side: int) -> Optics:
@@ -147,15 +152,17 @@ def ball_table(optics: Optics) -> BallTable:
     -------
     BallTable
     """
-    return _table(round(optics.mu_px * optics.sigma_px, 3))
+    return _table(round(optics.mu_px * optics.sigma_px, 3), round(optics.bend, 3))
 
 
-@lru_cache(maxsize=12)  # a fit asks for seven
-def _table(mu_sigma: float) -> BallTable:
-    """Build a table; much attenuation along one blur width makes a disc, little half an ellipse."""
+@lru_cache(maxsize=12)  # a fit asks for nine
+def _table(mu_sigma: float, bend: float) -> BallTable:
+    """Build a table; much attenuation along one blur width makes a disc, little half an ellipse, and film bends either."""
     blur = _blur()
     opacity = -np.expm1(-2 * mu_sigma * blur.half_chord)
     coarse = np.matmul(blur.kernel, (opacity * blur.weight)[:, :, None])[:, :, 0]
+    if bend:
+        coarse = film_curve(coarse, curve_of_bend(bend))
     n_y, n_x = (len(of) for of, _ in (blur.along_y, blur.along_x))
     return BallTable(coarse, np.zeros((3, n_y, n_x), np.float32), np.zeros(n_y // _ROWS + 1, bool))
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rsa_vision.detect.balls.fits import BallFits, radii
 from rsa_vision.detect.film.least_squares import weighted_least_squares
 from rsa_vision.detect.film.noise import NoiseModel
-from rsa_vision.detect.models.film_curve import by_film_curve, film_curve
+from rsa_vision.detect.models.film_curve import by_film_curve, curve_of_bend, film_curve
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.beside import all_but
@@ -164,11 +164,12 @@ def _told_curve(
     if len(asked) < _LEAST:
         return None
     each, start = float(noise.correlation.sum()), np.array([np.log(optics.sigma_px), np.log(optics.mu_px * optics.sigma_px), 0.0, 0.0])
-    straight = _state([_likelier(group, start) for group in asked], start, start, each)
+    bent = np.array([*start[_BLURS], *curve_of_bend(optics.bend)])  # of single balls; lapping ones tell more of the curve than those
+    straight = _state([_likelier(group, bent) for group in asked], bent, start, each)
     plain = _first_order(straight, _BLURS)
     begin = [straight]
     if any(not rest.group.one_light for rest in straight.rests):  # it may be the curve that makes up for what two take from each other
-        begin.append(_state([_rest(group, start) for group in asked], start, start, each))
+        begin.append(_state([_rest(group, bent) for group in asked], bent, start, each))
     least, found = straight.cost - plain, None
     for state in begin:
         if state.cost - _first_order(state, slice(0, 4)) > least - _PROMISING:
