@@ -12,6 +12,7 @@ from rsa_vision.detect.film.noise import estimate_noise
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.fits import fit_needles
+from rsa_vision.detect.needles.pins import proportion_of_pins
 from rsa_vision.detect.needles.pointed import is_pin
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.flags import MarkerFlag
@@ -94,19 +95,20 @@ def test_a_fit_that_ends_up_with_the_other_sign_is_no_pin(monkeypatch: pytest.Mo
     assert np.flatnonzero(gap > 1.0).tolist() == [int(tips[:, 0].argmin())]
 
 
+def _pin(depth: float, background: float) -> NeedleFit:
+    return NeedleFit(
+        np.zeros(2), np.zeros(1), NeedleShape(2.5, 20.0), np.array([depth]), depth, background, np.eye(2), 90, 1.33, 1.0, 0.85, 1.0,
+        0.115, 20.0, True,
+    )  # fmt: skip
+
+
 def test_chance_is_not_blamed_on_a_pin() -> None:
     rng = np.random.default_rng(1)
     noise = estimate_noise(np.rint(rng.normal(3e4, 100, (300, 300))).astype(np.uint16), 16)
 
-    def pin(n_core: int) -> NeedleFit:
-        """A pin five times as deep as the noise, under which a third more than that is left."""
-        return NeedleFit(
-            np.zeros(2), np.zeros(1), NeedleShape(2.5, 20.0), np.array([-500.0]), -500.0, 3e4, np.eye(2), n_core, 1.33, 1.0, 0.85, 1.0,
-            0.115, 20.0, True,
-        )  # fmt: skip
-
-    assert is_pin(pin(90), noise)  # two standard deviations of the mean square of so few pixels
-    assert not is_pin(pin(900), noise)
+    pin = _pin(-500.0, 3e4)  # five times as deep as the noise, under which a third more than that is left
+    assert is_pin(replace(pin, n_core=90), noise)  # two standard deviations of the mean square of so few pixels
+    assert not is_pin(replace(pin, n_core=900), noise)
 
 
 @pytest.mark.parametrize("seed", [6, 11])
@@ -413,3 +415,16 @@ def test_noise_that_the_end_of_the_range_cuts_off_beside_a_tip_is_told(room: flo
     found = detect_markers(values, bits=8).images
     assert len(found) >= len(tips) - 2
     assert (((found.flags & MarkerFlag.CLIPPED) > 0) == flagged).all()
+
+
+@pytest.mark.parametrize("proportion", [0.0, -0.5])
+def test_one_depth_that_is_far_off_does_not_tell_how_all_go_with_the_background(proportion: float) -> None:
+    """On a logarithmic plate they went 40 times as steeply as on any film, and tips lay a pixel off."""
+    rng = np.random.default_rng(3)
+    background = 50000.0 + rng.uniform(-4000, 4000, 16)
+    depth = -25000.0 + proportion * (background - 50000.0) + rng.normal(0, 300, 16)
+    pins = [_pin(of, on) for of, on in zip(depth, background, strict=True)]
+    off = _pin(-400000.0, background.max())
+    told, with_one = proportion_of_pins(pins), proportion_of_pins([off, *pins[1:]])
+    assert abs(told - proportion) < 0.15
+    assert abs(with_one - proportion) < 0.4

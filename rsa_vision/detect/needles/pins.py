@@ -46,6 +46,7 @@ from rsa_vision.types import Bool, Float
 _OTHER_BLURS_PX = BLURS_PX[1::2]  # of pins on films whose balls have another
 _KNOWN = 0.12  # of its length, to which the tip of a pin is known even at CNR 5: trabeculae are pointed anyhow
 _PRIOR = 0.5  # proportions expected: between 0 (logarithmic) and all of depth over background (linear)
+_FAR = 4.0  # median deviations of depths, beyond which one is no better known
 _POINT = 0.005  # of the half width: error along a pin without any noise
 # errors along a pin over its length: of what beams and film curves are besides, by the curve and the logarithm of the depth, by the others
 _OF_MODEL, _OF_UNLIKE, _OF_TAIL, _OF_MISFIT = 0.0015, 0.05, 0.03, 2.0
@@ -115,7 +116,7 @@ def _found_from(
     optics, taper, sample = _likeliest(film, rough[:_SAMPLE], trials, noise)
     if not any(is_pin(f, noise) for f in sample):
         return [], known
-    optics = replace(optics, proportion=_proportion([f for f in rough if f.explained > EXPLAINED]))
+    optics = replace(optics, proportion=proportion_of_pins([f for f in rough if f.explained > EXPLAINED]))
     more = [_refit(film, replace(f, shape=replace(f.shape, taper=taper)), optics, noise) for f in rough[_SAMPLE:_MOST_ASKED]]
     optics, told = common_optics(film, [f for f in sample + more if is_pin(f, noise)], optics, noise)
     tapers = TAPERS if min(abs(told - t) for t in TAPERS) < _NO_OTHER else sorted([*TAPERS, told], reverse=True)
@@ -138,7 +139,7 @@ def _found_from(
     pins, optics = fit_shared(film, pins, start, noise, parallel=False, alike=True)
     if more := others_like(film, pins, places, optics, noise):
         pins = _still(fit_all(film, [*pins, *more], optics, noise, again=MOST_TOGETHER), noise)
-        pins, optics = fit_shared(film, pins, replace(start, proportion=_proportion(pins)), noise, parallel=False, alike=True)
+        pins, optics = fit_shared(film, pins, replace(start, proportion=proportion_of_pins(pins)), noise, parallel=False, alike=True)
     if not tees:  # beside those a pin may be what is seen of one, and says so
         pins = [f for f in pins if np.linalg.eigvalsh(f.covariance_px2)[-1] < (_KNOWN * f.shape.length_px) ** 2]
         pins = [f for f, alone in zip(pins, without_company(pins), strict=True) if not alone or shows_its_form(f, noise)]
@@ -294,14 +295,27 @@ def _refit(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel
     return fit_needles(film, fit.position_px, fit.angles, fit.shape, optics, noise)
 
 
-def _proportion(pins: list[NeedleFit]) -> float:
-    """Estimate how the depth goes with the background, from pins on different backgrounds."""
+def proportion_of_pins(pins: list[NeedleFit]) -> float:
+    """Estimate how the depth goes with the background, from pins on different backgrounds.
+
+    Depths are known badly before the film curve is; one that is far off is drawn in, or it alone would tell.
+
+    Parameters
+    ----------
+    pins : list of NeedleFit
+
+    Returns
+    -------
+    float
+        As :attr:`Optics.proportion`; without pins 0.
+    """
     if not pins:
         return 0.0
     depth, background = (np.array([getattr(f, name) for f in pins]) for name in ("depth", "background"))
-    ratio = float(np.median(depth) / np.median(background))
-    slack = _PRIOR * abs(ratio) / max(float(np.median(np.abs(depth - np.median(depth)))), 1e-3 * abs(float(np.median(depth))))
-    b, d = background - np.median(background), depth - np.median(depth)
+    ratio, usual = float(np.median(depth) / np.median(background)), float(np.median(depth))
+    scatter = max(float(np.median(np.abs(depth - usual))), 1e-3 * abs(usual))
+    slack = _PRIOR * abs(ratio) / scatter
+    b, d = background - np.median(background), np.clip(depth - usual, -_FAR * scatter, _FAR * scatter)
     return float((b @ d + 0.5 * ratio / slack**2) / (b @ b + 1 / slack**2))
 
 
