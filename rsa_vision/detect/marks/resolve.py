@@ -154,6 +154,11 @@ def resolve_balls(
         blobs = join([blobs, fit_at(film, peaks, size, optics, noise, others, quick=True)])
     split = len(sure.depth) > 0 or needles is None  # else what arms leave is all there is
     pairs = split_blobs(film, blobs, sure, optics, noise, lambda: all_but(sure, np.arange(0), optics, beside)) if split else []
+    if pairs and not sized:  # these are the first to show what balls are like
+        paired = join(pairs)
+        peaks, size = lone_peaks(film, candidates, join([single, paired]), paired, optics, beside)
+        more = join([blobs.rows(~_taken(blobs, paired)), fit_at(film, peaks, size, optics, noise, others, quick=True)])
+        pairs += split_blobs(film, more, paired, optics, noise, lambda: all_but(paired, np.arange(0), optics, beside))
     fits += pairs
     if pairs:  # a blob that two balls explain is no ball
         good = good.rows(~_taken(good, join(pairs)) & ~_between(good, pairs))

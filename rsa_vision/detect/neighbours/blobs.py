@@ -14,6 +14,7 @@ from rsa_vision.detect.balls.find import SURE, plausible
 from rsa_vision.detect.balls.fits import BallFits
 from rsa_vision.detect.balls.usual import kinds_by_size
 from rsa_vision.detect.film.noise import NoiseModel
+from rsa_vision.detect.film.places import gaps
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
 from rsa_vision.detect.neighbours.groups import fit_group
@@ -23,8 +24,9 @@ LEAST_APART = 0.7  # of the radius: nearer centres cannot be told apart with con
 LEAST_GAIN = 30.0  # twice the log-likelihood that four parameters more must gain
 STRETCH = (1.0, 1.5)  # of the separation that the second moments suggest
 _BLOB = (0.7, 2.2)  # radii of blobs, relative to the film's balls, that two of those may make
-_DEPTH = (0.4, 2.5)  # depths of the two, relative to balls of their size
+_DEPTH, _DEPTH_GUESSED = (0.4, 2.5), (0.4, 5.0)  # depths of the two, relative to balls of their size, or to what one ball makes of both
 OF_A_BLOB = 0.8  # of the radius of a ball fitted to two
+_ALIKE, _GUESSED = 0.3, 0.6  # logarithms of radii of one size, and of one of which no more is known than what two make together
 CLEAR, NEARLY = 2.0 * SURE, 0.6  # significance of blobs that tell, and the part of blobs that one ball explains
 _VAIN = 40  # attempts of a film that may fail
 _COMPANY = 2  # balls of one size
@@ -61,7 +63,8 @@ def split_blobs(
     if len(like.depth) == 0:
         return []
     usual = _usual(like)
-    sizes = _sizes(like, noise) if len(balls.depth) else [_Size(OF_A_BLOB * usual.radius, usual.depth)]
+    guessed = not len(balls.depth)
+    sizes = [_Size(OF_A_BLOB * usual.radius, usual.depth)] if guessed else _sizes(like, noise)
     least_radius, most_radius, least_depth = min(s.radius for s in sizes), max(s.radius for s in sizes), min(s.depth for s in sizes)
     worth = (blobs.radius_px > _BLOB[0] * least_radius) & (blobs.radius_px < _BLOB[1] * most_radius)
     deep = np.abs(blobs.depth) > _DEPTH[0] * least_depth
@@ -87,10 +90,23 @@ def split_blobs(
         for offsets, radius in _starts(sizes):
             starts = whole.position_px + offsets[:, None] * axis
             pair = fit_group(film, starts, radius, optics, noise, others)
-            if _two(pair, whole, sizes, least, noise):
-                out.append(pair)
+            if _two(pair, whole, sizes, least, noise, guessed=guessed):
+                if not any(_same(pair, known) for known in out):  # a look between two, and one at either of them
+                    out.append(pair)
                 break
-    return out
+    return _of_one_size(out) if guessed else out
+
+
+def _same(pair: BallFits, other: BallFits) -> bool:
+    """Say whether each of two balls lies on one of two others."""
+    return bool((gaps(pair.position_px, other.position_px).min(axis=1) < LEAST_APART * pair.radius_px).all())
+
+
+def _of_one_size(pairs: list[BallFits]) -> list[BallFits]:
+    """Leave out pairs of another size than is usual, where pairs alone tell what that is."""
+    radius = np.array([pair.radius_px for pair in pairs]).reshape(-1, 2)
+    odd = np.abs(np.log(radius / np.median(radius))).max(axis=1, initial=0.0) > _ALIKE if len(pairs) else np.zeros(0, bool)
+    return [pair for pair, apart in zip(pairs, odd, strict=True) if not apart]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,12 +142,14 @@ def _starts(sizes: list[_Size]) -> Iterator[tuple[Float, Float]]:
                     yield stretch * between * np.array([part - 1, part]), np.array([first.radius, second.radius])
 
 
-def _two(pair: BallFits, whole: BallFits, sizes: list[_Size], least: float, noise: NoiseModel) -> bool:
+def _two(pair: BallFits, whole: BallFits, sizes: list[_Size], least: float, noise: NoiseModel, *, guessed: bool) -> bool:
+    """Say whether these are two balls of the sizes of the film's, which may be no more than guessed."""
+    within, (shallow, deepest) = (_GUESSED, _DEPTH_GUESSED) if guessed else (_ALIKE, _DEPTH)
     apart = float(np.hypot(*(pair.position_px[1] - pair.position_px[0])))
     radius, depth = (np.array([getattr(s, of) for s in sizes]) for of in ("radius", "depth"))
     size = np.abs(np.log(pair.radius_px[:, None] / radius))
     deep = np.abs(pair.depth)[:, None] / depth
-    alike = ((size < 0.3) & (deep > _DEPTH[0]) & (deep < _DEPTH[1])).any(axis=1)
+    alike = ((size < within) & (deep > shallow) & (deep < deepest)).any(axis=1)
     one_sign = pair.depth[0] * pair.depth[1] > 0
     of_size = radius[size.argmin(axis=1)]
     held = bool((np.hypot(*(pair.position_px - whole.position_px[0]).T) < 2.5 * of_size.mean()).all())
