@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.balls.usual import kinds_by_size, over_kinds
 
-from .films import film_of_balls, grid_of_balls, stored
+from .films import film_of_balls, grid_of_balls, stored, strip
 
 SIDE, CELL = 600, 60.0
 RADII = 3.0, 3.75
@@ -147,3 +147,31 @@ def test_what_is_larger_is_compared_with_its_own_kind() -> None:
     assert spread[6] < 0.04
     assert spread[7] < 0.04
     assert kinds_by_size(np.array([2.0, 3.0, 5.0]), 2)[0].tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("cnr", [4.0, 5.0, 6.0])
+def test_short_strokes_in_noise_are_no_balls(cnr: float) -> None:
+    """Whole films of faint pins and tees passed for balls without a flag: noise hides in each what all of them together show."""
+    rng = np.random.default_rng(0)
+    middle, _ = grid_of_balls(rng, 6, 90.0, (1.0, 1.0))
+    film = 30000 + 400 * rng.standard_normal((560, 560))
+    for place in middle:
+        turn = rng.uniform(0, np.pi)
+        along = 4.5 * np.array([np.cos(turn), np.sin(turn)])
+        film -= 400 * cnr * strip(film.shape, place - along, place + along, 3.0, 1.3)
+    images = detect_markers(stored(film), bits=16).images
+    assert len(images)
+    assert not (images.flags == 0).any()
+
+
+@pytest.mark.parametrize("cnr", [4.0, 5.0, 6.0])
+def test_faint_balls_are_no_strokes(cnr: float) -> None:
+    flags = []
+    for seed in range(FILMS):
+        rng = np.random.default_rng(seed)
+        truth, _ = grid_of_balls(rng, 6, 90.0, (1.0, 1.0))
+        radius, depth = np.full(len(truth), 3.5), 400 * cnr / 30000
+        film = film_of_balls((560, 560), truth, radius, depth=depth, sigma_px=1.3, noise_sd=400.0, rng=rng)
+        flags += detect_markers(stored(film), bits=16).images.flags.tolist()
+    print(f"{len(flags)} of {36 * FILMS}, {np.count_nonzero(flags)} flagged")
+    assert np.count_nonzero(flags) < 0.05 * len(flags)

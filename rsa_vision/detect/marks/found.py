@@ -34,12 +34,12 @@ from rsa_vision.detect.needles.balls_beside import lapped
 from rsa_vision.detect.needles.first_pins import look_for_pins
 from rsa_vision.detect.needles.fits import significant_misfit
 from rsa_vision.detect.needles.pins import find_pins
-from rsa_vision.detect.needles.sets import as_usual, is_located, on_arms
+from rsa_vision.detect.needles.sets import as_usual, located, on_arms
 from rsa_vision.detect.needles.tees import find_tees, is_tee
 from rsa_vision.detect.neighbours.beside import MOST_IN_GROUP, groups_of, images_beside, lapping_balls
 from rsa_vision.detect.neighbours.holes import are_holes
 from rsa_vision.detect.neighbours.laid_on import fit_over, look_on_arms, over_arms
-from rsa_vision.detect.neighbours.not_round import are_not_round
+from rsa_vision.detect.neighbours.not_round import are_long, are_not_round
 from rsa_vision.detect.neighbours.rims import cut_from_outlines, goes_on
 from rsa_vision.detect.neighbours.rows import in_bars, in_rows, like_those_in_rows
 from rsa_vision.detect.neighbours.under_curve import under_curve
@@ -146,7 +146,7 @@ def _find_needles(
     free = ~(on_arms(places, perhaps) | are_within(places, clear.position_px, clear.radius_px))
     lines = _long_places(mine, round_ones)
     pins, pin_optics = find_pins(film, rough_pins, places[free], lines, perhaps, sign, optics, noise)
-    tees, pins = [_seen(tees, noise), _seen([p for p in pins if is_located(p)], noise)]
+    tees, pins = [_seen(tees, noise), _seen(located(pins), noise)]
     painted = _painted(tees, pins, tee_optics, pin_optics)
     hidden = _under_no_pins(film, mine, rough_pins, [*perhaps, *pins], noise)
     looks = off_pins(seen.looks, more_pins)
@@ -168,7 +168,7 @@ def _with_beaded(film: NDArray[Any], found: Balls, needles: _Needles, seen: Seen
     fitted = find_beaded(film, needles.pins, needles.painted, found.fits, seen.optics, needles.pin_optics, seen.noise)
     if fitted is None:
         return None
-    pins = _seen([p for p in fitted[0] if is_located(p)], seen.noise)
+    pins = _seen(located(fitted[0]), seen.noise)
     return replace(needles, pins=pins, pin_optics=fitted[1], painted=_painted(needles.tees, pins, needles.tee_optics, fitted[1]))
 
 
@@ -331,13 +331,19 @@ def _measured(
     keep = left < _BENT * MISFIT
     ends = goes_on(film, balls, np.arange(len(poor)), beside, optics.sigma_px)
     keep &= ~(poor & ends)
-    poor[lone] |= are_not_round(film, single, lambda i, *at: beside(int(lone[i]), *at), optics, noise)
+
+    def beside_single(i: int, cols: Float, rows: Float) -> tuple[Float, Bool]:
+        return beside(int(lone[i]), cols, rows)
+
+    poor[lone] |= are_not_round(film, single, beside_single, optics, noise)
+    clear_ones = np.count_nonzero(look_clear(single, noise))
+    strokes = clear_ones < LEAST_KNOWN and are_long(film, single, beside_single, optics, noise)  # else they show what each of them is like
     touching = touching | ends | pulled  # something as high as itself beside it, which a ball on the end of a bar has as well
     balls, ratio, touching, poor, rowed = balls.rows(keep), ratio[keep], touching[keep], poor[keep], around.rowed[keep]
     added = added[np.append(keep, np.ones(len(others), bool))]
     one, other = lapping_balls(balls)
     poor |= rowed | np.isin(np.arange(len(poor)), one[poor[other]])  # what one of them leaves may be another's
-    doubtful = rowed | like_those_in_rows(balls.position_px, balls.radius_px, balls.depth, rowed, poor)
+    doubtful = rowed | strokes | like_those_in_rows(balls.position_px, balls.radius_px, balls.depth, rowed, poor)
     doubtful |= in_bars(balls.position_px, balls.radius_px, balls.depth)
     doubtful |= cut_from_outlines(touching, ends[keep]) | are_holes(film, balls, optics.sigma_px)
     doubtful |= lost_in_a_crowd(balls, _off_needles(faint, others))

@@ -34,6 +34,7 @@ _OF_SURFACE, _INTERVALS = 6, 40  # terms of a background without an edge; betwee
 _LEAST_SEEN = 1.0  # sum of squares, over the pixels, of a part of that
 _LAPPING = 0.02  # of full opacity, from which the product of two shadows counts
 _GAIN = (0.3, 3.0)  # bounds of the depth along a needle, relative to its middle
+_FAINTEST = 0.02  # of the height of an image, from which it is one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,6 +139,37 @@ def chi2_of(window: Window, fit: NeedleFit, optics: Optics, noise: NoiseModel) -
     linear = np.concatenate([image[None], window.surface])
     left = window.data - weighted_least_squares(linear.T, weight, window.data) @ linear
     return float(np.sum(weight * left**2))
+
+
+def left_under(window: Window, fits: Sequence[NeedleFit], optics: Optics, noise: NoiseModel) -> tuple[Float, int]:
+    """Compare fits of one thing by what each leaves of it, on the same pixels: those on which any of them has an image.
+
+    Parameters
+    ----------
+    window : Window
+        Around all of them.
+    fits : sequence of NeedleFit
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    chi2 : ndarray of shape (n,)
+        Squared residuals over the variance of the noise; depth and background of each are free.
+    pixels : int
+    """
+    weight, seen, residuals = 1.0 / noise.variance_at(window.data + window.beside), np.zeros(len(window.data), bool), []
+    for f in fits:
+        image = needle_image(window.cols - f.position_px[0], window.rows - f.position_px[1], f, optics)
+        seen |= np.abs(image) > _FAINTEST * np.abs(image).max(initial=0.0)
+        if optics.proportion:
+            background = (
+                weighted_least_squares(np.concatenate([image[None], window.surface]).T, weight, window.data)[2:] @ window.surface[1:]
+            )
+            image = image * gain_at(f, background, optics)
+        linear = np.concatenate([image[None], window.surface])
+        residuals.append(window.data - weighted_least_squares(linear.T, weight, window.data) @ linear)
+    return np.square(np.array(residuals)[:, seen]) @ weight[seen], int(np.count_nonzero(seen))
 
 
 def fit_crossing(

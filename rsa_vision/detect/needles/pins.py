@@ -25,6 +25,7 @@ from rsa_vision.detect.needles.of_a_kind import (
     are_of_a_kind,
     are_of_one_size,
     odd_lengths,
+    of_usual_width,
     others_like,
     without_company,
 )
@@ -136,7 +137,7 @@ def _found_from(
         pins = distinct_pins([*pins, *others]) if others else pins
     pins = _still(fit_all(film, pins, optics, noise, again=MOST_TOGETHER), noise)
     start = _without_what_they_told(optics, known)
-    pins, optics = fit_shared(film, pins, start, noise, parallel=False, alike=True)
+    pins, optics = fit_shared(film, of_usual_width(pins), start, noise, parallel=False, alike=True)
     if more := others_like(film, pins, places, optics, noise):
         pins = _still(fit_all(film, [*pins, *more], optics, noise, again=MOST_TOGETHER), noise)
         pins, optics = fit_shared(film, pins, replace(start, proportion=proportion_of_pins(pins)), noise, parallel=False, alike=True)

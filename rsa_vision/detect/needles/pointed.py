@@ -13,7 +13,7 @@ from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit, either_way, turned, unexplained
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.models.shown import Images
-from rsa_vision.detect.needles.crossing import Unseen, chi2_of, fit_crossing, window_of
+from rsa_vision.detect.needles.crossing import Unseen, chi2_of, fit_crossing, left_under, window_of
 from rsa_vision.detect.needles.fits import STANDS_OUT, explains, fit_needles, significant_misfit
 
 SLIM = 4.5  # length over half the width; two balls side by side have four
@@ -111,9 +111,12 @@ def points_one_way(
     -------
     bool
     """
-    both = either_way(fit)
-    left, more = (fit_crossing(film, [f], optics, noise, others=others, unseen=unseen, edge=fit.edged)[0].chi2_core for f in both)
-    return bool(more - left > 2 * _ONE_WAY * max(left, 1.0) / fit.n_core + _OF_LEFT * max(left - 1.0, 0.0))
+    both = [fit_crossing(film, [f], optics, noise, others=others, unseen=unseen, edge=fit.edged)[0] for f in either_way(fit)]
+    window = window_of(film, both, optics, noise, others, unseen=unseen)
+    if fit.edged:
+        window = window.with_edge(both[:1], optics)
+    (left, more), pixels = left_under(window, both, optics, noise)  # of its own image the other may leave as little: half of the pin is
+    return bool(more - left > 2 * _ONE_WAY * max(left / max(pixels, 1), 1.0) + _OF_LEFT * max(left - pixels, 0.0))
 
 
 def surer_than_rod(film: NDArray[Any], fit: NeedleFit, optics: Optics, noise: NoiseModel) -> float:

@@ -23,6 +23,7 @@ from rsa_vision.types import Bool, Float
 TAPERS = (1.0, 0.5, 0.25)  # part of a pin's length that is its point: a full cone, or a cylinder with a point
 MOST_TOGETHER = 4  # in one fit; larger sets are cut where they overlap least
 NEAREST_PX = 3.0  # two tips nearer than this are one
+_ABOUT_AS_WELL = 1.5  # of the standard deviation along that tips of a film have
 _LOCATED = 1.5  # half widths: standard deviation of a tip from which it marks nothing
 _BESIDE_PX = 10.0  # from the ends of arms, a little longer than they are, within which others are beside them
 
@@ -93,6 +94,24 @@ def _images(near: list[NeedleFit], optics: Optics) -> Images | None:
 def is_located(needle: NeedleFit) -> bool:
     """Say whether the tip is known better than the needle is wide: the rim of something large is as long as one likes and marks nothing."""
     return bool(np.linalg.eigvalsh(needle.covariance_px2)[-1] < (_LOCATED * needle.shape.half_width_px) ** 2)
+
+
+def located(needles: list[NeedleFit]) -> list[NeedleFit]:
+    """Keep needles whose tips are located, and where some are, all whose tips are known about as well: blur and curve hide them alike.
+
+    Parameters
+    ----------
+    needles : list of NeedleFit
+
+    Returns
+    -------
+    list of NeedleFit
+    """
+    kept = np.array([is_located(f) for f in needles], bool)
+    if np.count_nonzero(kept) >= LEAST_OF_A_KIND:
+        variance = np.array([np.linalg.eigvalsh(f.covariance_px2)[-1] for f in needles])
+        kept |= variance < _ABOUT_AS_WELL**2 * np.median(variance[kept])
+    return [f for f, of in zip(needles, kept, strict=True) if of]
 
 
 def as_usual(tee: NeedleFit, others: list[NeedleFit]) -> NeedleFit:

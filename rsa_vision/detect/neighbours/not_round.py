@@ -37,6 +37,11 @@ _CLEAR = 0.25  # of the usual squared depth over noise, from which an error of t
 _OF_MODEL, _MOST_OF_MODEL = 3.0, 0.03
 _QUIET = 0.5  # chi2 beside balls: filters that leave less noise there than under them make outlines as well
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
+_LEAST_TOGETHER, _MOST_OF_ONE, _SURE_TOGETHER = (
+    5,
+    20.0,
+    3.0,
+)  # images asked together, most chi2 of one, standard deviations
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
 _CORNERS = 0.06  # of the radius, by which outlines go in and out four times: blurred squares by 0.08, what a median filter leaves by 0.05
 _BENDS = np.arange(9, 14)  # of what is fitted: slopes and bends of the background
@@ -64,10 +69,7 @@ def are_not_round(film: NDArray[Any], balls: BallFits, beside: Beside, optics: O
     """
     if len(balls.depth) == 0:
         return np.zeros(0, bool)
-    outlines, covariance = _outlines(film, balls, beside, optics, noise)
-    if len(outlines) >= _LEAST_KNOWN:
-        outlines[:, :2] -= np.median(outlines[:, :2], axis=0)  # a focal spot draws all images alike
-    covariance = covariance * np.maximum(balls.chi2_ring, 1.0)[:, None, None]
+    outlines, covariance = _outlines_over_usual(film, balls, beside, optics, noise)
     apart, chance = outlines[:, :2], chi2(outlines[:, :2], covariance[:, :2, :2])
     length = np.hypot(*apart.T) / balls.radius_px**2
     usual = max(1.0, float(np.median(chance)) / _MEDIAN)
@@ -96,6 +98,37 @@ def are_not_round(film: NDArray[Any], balls: BallFits, beside: Beside, optics: O
         told |= (chance > _AMONG_OTHERS) & (length > _MUCH)
     square = chi2(outlines[:, 2:], covariance[:, 2:, 2:]) > _BEYOND_DOUBT
     return np.asarray(told | (square & (np.hypot(*outlines[:, 2:].T) > _CORNERS * balls.radius_px)))
+
+
+def are_long(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> bool:
+    """Say whether images of which noise hides what each is like are longer one way than the other as a whole: short strokes pass for balls.
+
+    Parameters
+    ----------
+    film : ndarray of shape (rows, cols)
+    balls : BallFits
+    beside : callable
+    optics : Optics
+    noise : NoiseModel
+
+    Returns
+    -------
+    bool
+        The mean of their chi2, each of two degrees of freedom, is beyond chance.
+    """
+    if len(balls.depth) < _LEAST_TOGETHER:
+        return False
+    outlines, covariance = _outlines_over_usual(film, balls, beside, optics, noise)
+    each = np.minimum(chi2(outlines[:, :2], covariance[:, :2, :2]), _MOST_OF_ONE)
+    return bool(each.mean() > 2 + _SURE_TOGETHER * 2 / np.sqrt(len(each)))
+
+
+def _outlines_over_usual(film: NDArray[Any], balls: BallFits, beside: Beside, optics: Optics, noise: NoiseModel) -> tuple[Float, Float]:
+    """Outlines as of :func:`_outlines`, over what a focal spot makes of all; what lies around balls adds to their covariances."""
+    outlines, covariance = _outlines(film, balls, beside, optics, noise)
+    if len(outlines) >= _LEAST_KNOWN:
+        outlines[:, :2] -= np.median(outlines[:, :2], axis=0)
+    return outlines, covariance * np.maximum(balls.chi2_ring, 1.0)[:, None, None]
 
 
 def _model_error(balls: BallFits, noise: NoiseModel) -> Float:
