@@ -112,10 +112,19 @@ def points_one_way(
     bool
     """
     both = [fit_crossing(film, [f], optics, noise, others=others, unseen=unseen, edge=fit.edged)[0] for f in either_way(fit)]
+    of_own, of_other = (f.chi2_core * fit.n_core for f in both)
+    if _surely_more(of_own, of_other, fit.n_core):
+        return True
+    # the other may leave as little of its own image, a half of the pin: on the same pixels it leaves more
     window = window_of(film, both, optics, noise, others, unseen=unseen)
     if fit.edged:
         window = window.with_edge(both[:1], optics)
-    (left, more), pixels = left_under(window, both, optics, noise)  # of its own image the other may leave as little: half of the pin is
+    (left, more), pixels = left_under(window, both, optics, noise)
+    return _surely_more(left, more, pixels)
+
+
+def _surely_more(left: float, more: float, pixels: int) -> bool:
+    """Say whether of so many pixels something leaves more than what leaves less, by chance and by what that leaves beyond noise."""
     return bool(more - left > 2 * _ONE_WAY * max(left / max(pixels, 1), 1.0) + _OF_LEFT * max(left - pixels, 0.0))
 
 
