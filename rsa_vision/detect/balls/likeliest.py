@@ -28,7 +28,7 @@ _BY_STEP = np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])  # of 
 _PLAIN, _BENT = 2, 3  # numbers of the optics: without a bend of the film curve and with it
 _SURELY_BENT, _MOST_BENT = 9.0, 2.0  # twice the log-likelihood that it must gain; as bent as that
 _BENDS = 0.0, -0.75  # from where it is looked for: the other that of logarithms, of a ball that lets a fifth of the light pass
-_SMALL = 1.2  # blur widths, of a radius
+_SMALL, _SURELY_LARGER = 1.2, 2.5  # blur widths, of a radius, and of one that is guessed with another blur
 _SIGMA_PX, _KAPPA = (0.4, 4.0), (0.03, 4.0)
 _ROUNDS = 8
 _STEP = 0.05  # of the logarithms and the bend, for derivatives
@@ -80,11 +80,14 @@ def with_bend(film: NDArray[Any], looks: BallFits, optics: Optics, noise: NoiseM
     -------
     Optics
     """
+    looks = looks.rows(np.argsort(-looks.significance, kind="stable")[:_MOST_ASKED])
+    if len(looks.depth) < LEAST_KNOWN or np.median(looks.radius_px) > _SURELY_LARGER * optics.sigma_px:
+        return optics
     fits = fit_at(film, looks.position_px, looks.radius_px, optics, noise, quick=True)
     clear = fits.rows(look_clear(fits, noise) & (fits.valid_fraction > _WHOLE) & (fits.window_fraction > _INSIDE))
     if len(clear.depth) < LEAST_KNOWN or np.median(clear.radius_px) > _SMALL * optics.sigma_px:
         return optics
-    asked, fits = _ask(film, clear.rows(np.argsort(-clear.significance, kind="stable")[:_MOST_ASKED]), optics, noise)
+    asked, fits = _ask(film, clear, optics, noise)
     now = asked.equations(fits, optics, _BENT)
     say, best, most = _summed(fits, optics, now)[0], optics, _SURELY_BENT
     for bend in _BENDS:
