@@ -20,7 +20,7 @@ from rsa_vision.detect.marks.settle import STRUCTURE
 from rsa_vision.detect.models.needles import NeedleFit, wrapped
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.arms import badly_placed, lone_tees, meet_others, perhaps_arms
-from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, excess_of, significant_misfit
+from rsa_vision.detect.needles.fits import LINE_PX, excess_of, significant_misfit
 from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.detect.needles.states import LEAST_TAPER
 from rsa_vision.flags import MarkerFlag
@@ -29,7 +29,6 @@ from rsa_vision.types import Bool, Float, MarkerImages
 EXACT_PX = 0.002  # error of a centre without any noise: what areas of pixels and rims of balls are rounded to, here and in other programs
 WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
-_LINE_PX = 1.01 * LEAST_HALF_WIDTH_PX  # half width of a needle that is a line
 _BLURRED = 2.0  # blur widths to which an image goes beyond its ball
 _BLUNT = 1.01 * LEAST_TAPER  # needles that are no more pointed than a fit lets them be have no tip
 _SEVERAL = 5  # tees that tell of all
@@ -138,7 +137,7 @@ def table_of(
         flags[kind] |= MarkerFlag.UNLIKE * of_odd_size(radius[kind], np.zeros(len(kind)), NEEDLES_ALIKE)
     snr = depth / np.sqrt(noise.variance_at(background))
     flags[n:][(arms == 3) & badly_placed(covariance[n:], radius[n:], snr[n:])] |= MarkerFlag.UNLIKE
-    flags[n:][perhaps_arms(needles, junctions) | meet_others(film, needles) | (radius[n:] <= _LINE_PX)] |= MarkerFlag.UNLIKE
+    flags[n:][perhaps_arms(needles, junctions) | meet_others(film, needles) | (radius[n:] <= LINE_PX)] |= MarkerFlag.UNLIKE
     flags[n:][[t.shape.taper <= _BLUNT for t in needles]] |= MarkerFlag.UNLIKE
     poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in needles]) > DOUBTFUL * MISFIT])
     if np.count_nonzero(arms == 3) >= _SEVERAL and poor[n:][arms == 3].mean() > 0.5:  # what most of them are not, none is for sure

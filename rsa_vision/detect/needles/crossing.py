@@ -136,9 +136,15 @@ def chi2_of(window: Window, fit: NeedleFit, optics: Optics, noise: NoiseModel) -
     """Return what a fit leaves of a window, depth and background being free: squared residuals over the variance of the noise."""
     image = needle_image(window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit, optics)
     weight = 1.0 / noise.variance_at(np.full(len(window.data), float(np.median(window.data))))
-    linear = np.concatenate([image[None], window.surface])
-    left = window.data - weighted_least_squares(linear.T, weight, window.data) @ linear
+    left, _ = _left_by(image, window, weight)
     return float(np.sum(weight * left**2))
+
+
+def _left_by(image: Float, window: Window, weight: Float) -> tuple[Float, Float]:
+    """Return what an image of any depth leaves of a window (n,), and the background over its mean."""
+    linear = np.concatenate([image[None], window.surface])
+    theta = weighted_least_squares(linear.T, weight, window.data)
+    return np.asarray(window.data - theta @ linear), np.asarray(theta[2:] @ window.surface[1:])
 
 
 def left_under(window: Window, fits: Sequence[NeedleFit], optics: Optics, noise: NoiseModel) -> tuple[Float, int]:

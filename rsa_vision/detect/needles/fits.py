@@ -18,6 +18,7 @@ from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float
 
 LEAST_HALF_WIDTH_PX = 0.6  # a needle that comes out as thin as that has no width of its own
+LINE_PX = 1.01 * LEAST_HALF_WIDTH_PX  # half width of one that has come out so
 _STEPS = 14
 _DEEPER = 2.0  # times the height of an image: a depth beyond that is what thin opacity would come to, and no measure
 _CONVERGED_PX = 5e-3  # a step's change: what is left after it is far less

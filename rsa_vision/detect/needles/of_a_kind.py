@@ -18,7 +18,7 @@ from rsa_vision.detect.film.patches import Box
 from rsa_vision.detect.models.needles import NeedleFit, turned, unexplained
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.detect.needles.crossing import fit_crossing
-from rsa_vision.detect.needles.fits import LEAST_HALF_WIDTH_PX, explains, fit_needles
+from rsa_vision.detect.needles.fits import LINE_PX, explains, fit_needles
 from rsa_vision.detect.needles.laid_over import LIKENESS, LaidOver, laid_over
 from rsa_vision.detect.needles.pointed import (
     LEAST_OF_A_KIND,
@@ -36,7 +36,6 @@ _MOST_IN_VAIN = 50  # places in a row at which there are none
 _ROUGHLY = 0.5  # of what a pin must have, for a closer look
 _ODD = 6.0  # half the chi2 by which chance makes a pin of the known size worse than a rod, or a pin, of free size
 _PALE = 0.5  # of the typical depth
-_LINE_PX = 1.01 * LEAST_HALF_WIDTH_PX  # half width of a needle that is a line
 # logarithms of half width and length: how far first looks of one kind differ, and pins of one; part of a film's pins that are of one
 _ROUGHLY_ALIKE, _ALIKE, _MOST = 0.35, 0.12, 0.6
 _AS_THICK = 0.2  # logarithm of half width: of pins aslant, that look shorter the more they are so
@@ -185,7 +184,7 @@ def of_usual_width(pins: list[NeedleFit]) -> list[NeedleFit]:
     list of NeedleFit
         In the same order; those are of the usual width, and as much deeper than they show as others.
     """
-    line = np.array([f.shape.half_width_px <= _LINE_PX for f in pins], bool)
+    line = np.array([f.shape.half_width_px <= LINE_PX for f in pins], bool)
     lines = int(np.count_nonzero(line))
     if len(pins) - lines < max(LEAST_OF_A_KIND, lines):
         return pins

@@ -37,11 +37,8 @@ _CLEAR = 0.25  # of the usual squared depth over noise, from which an error of t
 _OF_MODEL, _MOST_OF_MODEL = 3.0, 0.03
 _QUIET = 0.5  # chi2 beside balls: filters that leave less noise there than under them make outlines as well
 _LEAST_KNOWN = 6  # images that tell how a focal spot draws all
-_LEAST_TOGETHER, _MOST_OF_ONE, _SURE_TOGETHER = (
-    5,
-    20.0,
-    3.0,
-)  # images asked together, most chi2 of one, standard deviations
+# of images that are asked together: how few, the most that one's chi2 counts, and standard deviations beyond chance
+_LEAST_TOGETHER, _MOST_OF_ONE, _SURE_TOGETHER = 5, 20.0, 3.0
 _MUCH = 0.12  # of the squared radius: twice what a focal spot makes of the smallest balls
 _CORNERS = 0.06  # of the radius, by which outlines go in and out four times: blurred squares by 0.08, what a median filter leaves by 0.05
 _BENDS = np.arange(9, 14)  # of what is fitted: slopes and bends of the background
