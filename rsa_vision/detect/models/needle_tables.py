@@ -201,6 +201,22 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
     return values
 
 
+def steeper_by(half_width: float, length: float, taper: float, optics: Optics, wider: float, longer: float) -> Float:
+    """How much steeper a needle so much wider and longer is, along and across, than that of the table whose grid is stretched to it."""
+    by = np.array([1.0, wider, longer])
+    squares = by @ _slopes(half_width, length, taper, optics) @ by
+    return np.asarray(np.sqrt(squares))
+
+
+@lru_cache(maxsize=1024)
+def _slopes(half_width: float, length: float, taper: float, optics: Optics) -> Float:
+    """Sums of products of the slopes, along and across (first axis), of a table's opacity and its derivatives by size; of the first is one."""
+    nodes = table(half_width, length, taper, optics, 0.0, "")[:3].astype(np.float64)
+    slopes = np.array([np.gradient(of) for of in nodes]).reshape(3, 2, -1).swapaxes(0, 1)
+    products = slopes @ slopes.swapaxes(1, 2)
+    return np.asarray(products / products[:, :1, :1])
+
+
 def _by_optics(base: Single, half_width: float, length: float, taper: float, optics: Optics, slant: float) -> list[Single]:
     factor = float(np.exp(STEP))
     dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rsa_vision.detect.models.needle_tables import FINE_Q, LOG_GRID, Key, cell_of, look_up, table, table_for
+from rsa_vision.detect.models.needle_tables import FINE_Q, LOG_GRID, Key, cell_of, look_up, steeper_by, table, table_for
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
 
@@ -185,7 +185,7 @@ def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, opti
 
     In order: logarithms of attenuation and blur, taper, the two of the curve, tail, late, logged, the two of what is uneven.
     """
-    seen = _Seen.of(dx, dy, angles, shape, optics)
+    seen = _Seen.of(dx, dy, angles, shape, optics, nearest=True)
     *rows, by_along, by_oblique = seen.looked_up("optics", [0.0] * len(angles))
     c, s = np.cos(2 * angles)[seen.arm], np.sin(2 * angles)[seen.arm]
     return seen.spread([*rows, c * by_along + s * by_oblique, s * by_along - c * by_oblique])
@@ -217,8 +217,10 @@ class _Seen:
     shape: tuple[int, ...]  # arms and pixels
 
     @staticmethod
-    def of(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> _Seen:
-        steps = (math.floor(math.log(size) / LOG_GRID) for size in (shape.half_width_px, shape.length_px))
+    def of(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, *, nearest: bool = False) -> _Seen:
+        """``nearest``: with tables of the nearest size, for what is not corrected for it; else with those of the next smaller one."""
+        step = round if nearest else math.floor
+        steps = (step(math.log(size) / LOG_GRID) for size in (shape.half_width_px, shape.length_px))
         key, first, middle, reach = table_for(*steps, shape.taper, optics)
         cell = cell_of(key[3].sigma_px)
         cell_s, cell_p = cell * shape.length_px / key[1], cell * shape.half_width_px / key[0]
@@ -252,7 +254,10 @@ class _Seen:
             off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
             value, *more = self.looked_up("ends", np.round(slants[0] - off_q, 4).tolist(), last)
             value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
-        value += (shape.half_width_px - self.key[0]) * more[0] + (shape.length_px * self.of_arms(shape.arms) - self.key[1]) * more[1]
+        wider, longer = shape.half_width_px - self.key[0], shape.length_px - self.key[1]
+        value += wider * more[0] + (shape.length_px * self.of_arms(shape.arms) - self.key[1]) * more[1]
+        if slopes:
+            more[-2:] = [steeper * of for of, steeper in zip(more[-2:], steeper_by(*self.key, wider, longer), strict=True)]
         return value, more
 
     def of_arms(self, arms: tuple[float, ...]) -> Float | float:
