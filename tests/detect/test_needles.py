@@ -59,6 +59,21 @@ def test_tables_are_the_image_of_blur_that_differs_by_direction(blur_px: tuple[f
     assert np.sqrt(((ours - image) ** 2).sum() / (image**2).sum()) < 0.02
 
 
+@pytest.mark.parametrize(("half_width", "length"), [(2.36, 23.3), (2.58, 25.0), (4.55, 42.0)])  # at a grid's node, and almost at the next
+@pytest.mark.parametrize("mu", [0.05, 0.5])
+def test_derivatives_are_as_steep_as_the_needle_whatever_the_table(half_width: float, length: float, mu: float) -> None:
+    rows, cols = np.mgrid[-2 * HALF : 2 * HALF + 1, -2 * HALF : 2 * HALF + 1].reshape(2, -1).astype(float)
+
+    def image(x: float, y: float, wide: float, long: float, turn: float) -> Float:
+        return arm_images(cols - x, rows - y, np.array([TURN + turn]), NeedleShape(wide, long), Optics(1.4, mu))[:6, 0]
+
+    at, step = np.array([0.3, 0.2, half_width, length, 0.0]), 0.02
+    for k, slope in enumerate(image(*at)[1:]):
+        high, low = (image(*(at + sign * step * (np.arange(5) == k)))[0] for sign in (1, -1))
+        expected = (high - low) / (2 * step)
+        assert expected @ slope / (slope @ slope) == pytest.approx(1.0, abs=0.03)
+
+
 def test_derivatives_by_what_is_uneven() -> None:
     rows, cols = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].reshape(2, -1).astype(float)
     angles, step = np.array([0.3, 1.87, -1.27]), 0.3  # so far that the grid of tables does not show
