@@ -268,7 +268,7 @@ def _lag_zero() -> Float:
 
 
 def _of_one_value(level: Float, variance: Float) -> Float:
-    """Take for classes whose values lie within the noise the median of them: where a film is even, the darkest tiles are those with marks."""
+    """Take for classes whose values lie within the noise the median of them: the darkest tiles of an even film are those with marks."""
     sd = np.sqrt(np.minimum(variance[:, None], variance))
     one = np.abs(level[:, None] - level) < _ONE_VALUE * sd
     return np.array([np.median(variance[of]) for of in one])

@@ -210,7 +210,7 @@ def steeper_by(half_width: float, length: float, taper: float, optics: Optics, w
 
 @lru_cache(maxsize=1024)
 def _slopes(half_width: float, length: float, taper: float, optics: Optics) -> Float:
-    """Sums of products of the slopes, along and across (first axis), of a table's opacity and its derivatives by size; of the first is one."""
+    """Sums of products of the slopes (along; across) of a table's opacity and its derivatives by size, over that of the first."""
     nodes = table(half_width, length, taper, optics, 0.0, "")[:3].astype(np.float64)
     slopes = np.array([np.gradient(of) for of in nodes]).reshape(3, 2, -1).swapaxes(0, 1)
     products = slopes @ slopes.swapaxes(1, 2)
