@@ -27,8 +27,6 @@ _STRUCTURE = 8.0  # times as much variance as film of its fine noise has elsewhe
 LAGS = 5  # correlation is followed to this distance in pixels
 _LEVELS = 12  # value classes of the variance curve
 _MORE_AT_ENDS, _APART = 4, 0.5  # classes more, of tiles that differ by so many standard deviations of the noise
-_ONE_VALUE = 0.5  # of the noise, by which values differ that are as noisy as each other
-_BY_CHANCE = 1.05  # times the variance of a class that holds nothing but noise
 _AS_FINE = 1.3  # of the roughness of the others
 _ENDS = (0.01, 0.99)  # parts of those between which the curve is to be known
 _MOST_MORE = 2.0  # times that it rises beyond its own end
@@ -234,9 +232,8 @@ def estimate_noise(film: NDArray[Any], bits: int) -> NoiseModel:
     # steps of one value are not how fine a film's noise is
     finest = min((r for r, v in zip(rough, curve, strict=True) if v > NO_NOISE), default=min(rough))
     ranked = ranked[np.array(rough)[ranked] < _STRUCTURE * max(finest, _OF_WHITE)]
-    level_array = np.array(level)[ranked]
-    curve_array = _smooth(level_array, _of_one_value(level_array, np.maximum(np.array(curve)[ranked], QUANTISATION)))
-    clean = np.array(curve)[ranked] < _BY_CHANCE * curve_array
+    level_array, curve_array = np.array(level)[ranked], _smooth(np.array(level)[ranked], np.maximum(np.array(curve)[ranked], QUANTISATION))
+    clean = curve_array >= np.array(curve)[ranked] * 0.999
     chosen = np.concatenate([quiet[k] for k, fine in zip(ranked, clean, strict=True) if fine])
     noisy = chosen[variance[chosen] > _ROUNDED * QUANTISATION]  # areas of one value say nothing of neighbours
     correlation, hidden = _correlation(rest[noisy], variance[noisy])
@@ -265,13 +262,6 @@ def _lag_zero() -> Float:
     """Return the correlation of white noise."""
     at_zero = (np.arange(-LAGS, LAGS + 1) == 0).astype(np.float64)
     return np.asarray(np.outer(at_zero, at_zero))
-
-
-def _of_one_value(level: Float, variance: Float) -> Float:
-    """Take for classes whose values lie within the noise the median of them: the darkest tiles of an even film are those with marks."""
-    sd = np.sqrt(np.minimum(variance[:, None], variance))
-    one = np.abs(level[:, None] - level) < _ONE_VALUE * sd
-    return np.array([np.median(variance[of]) for of in one])
 
 
 def _smooth(level: Float, variance: Float) -> Float:

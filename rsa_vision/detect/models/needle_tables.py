@@ -181,7 +181,7 @@ def table_for(
 
 @lru_cache(maxsize=_KEPT)
 def table(half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str) -> Single:
-    """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
+    """Opacity and its derivatives by half width and length as the grid stretches with them; then the slopes of the three along and across.
 
     ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur, by
     the taper, by the curve, by the tail, by what is late and logged and by what is uneven, alone.
@@ -195,26 +195,11 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
         nodes = [base, (wider - base) / ((GRID - 1) * half_width), (longer - base) / ((GRID - 1) * length)]
         if more == "ends":
             nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
-        nodes += np.gradient(base, cell_of(optics.sigma_px))
+        for of in nodes[:3]:
+            nodes += np.gradient(of, cell_of(optics.sigma_px))
     values = np.array(nodes, np.float32)
     values[:, [0, -1]] = values[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
     return values
-
-
-def steeper_by(half_width: float, length: float, taper: float, optics: Optics, wider: float, longer: float) -> Float:
-    """How much steeper a needle so much wider and longer is, along and across, than that of the table whose grid is stretched to it."""
-    by = np.array([1.0, wider, longer])
-    squares = by @ _slopes(half_width, length, taper, optics) @ by
-    return np.asarray(np.sqrt(squares))
-
-
-@lru_cache(maxsize=1024)
-def _slopes(half_width: float, length: float, taper: float, optics: Optics) -> Float:
-    """Sums of products of the slopes (along; across) of a table's opacity and its derivatives by size, over that of the first."""
-    nodes = table(half_width, length, taper, optics, 0.0, "")[:3].astype(np.float64)
-    slopes = np.array([np.gradient(of) for of in nodes]).reshape(3, 2, -1).swapaxes(0, 1)
-    products = slopes @ slopes.swapaxes(1, 2)
-    return np.asarray(products / products[:, :1, :1])
 
 
 def _by_optics(base: Single, half_width: float, length: float, taper: float, optics: Optics, slant: float) -> list[Single]:

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rsa_vision.detect.models.needle_tables import FINE_Q, LOG_GRID, Key, cell_of, look_up, steeper_by, table, table_for
+from rsa_vision.detect.models.needle_tables import FINE_Q, LOG_GRID, Key, cell_of, look_up, table, table_for
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
 
@@ -247,17 +247,18 @@ class _Seen:
 
     def values(self, shape: NeedleShape, slants: Float | None, *, slopes: bool) -> tuple[Float, list[Float]]:
         """Return the opacity and what else the tables hold."""
-        last = None if slopes else -2
+        last = None if slopes else -6
         if slants is None:
             value, *more = self.looked_up("", [0.0] * len(self.keys), last)
         else:
             off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
             value, *more = self.looked_up("ends", np.round(slants[0] - off_q, 4).tolist(), last)
             value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
-        wider, longer = shape.half_width_px - self.key[0], shape.length_px - self.key[1]
-        value += wider * more[0] + (shape.length_px * self.of_arms(shape.arms) - self.key[1]) * more[1]
+        wider, longer = shape.half_width_px - self.key[0], shape.length_px * self.of_arms(shape.arms) - self.key[1]
+        value += wider * more[0] + longer * more[1]
         if slopes:
-            more[-2:] = [steeper * of for of, steeper in zip(more[-2:], steeper_by(*self.key, wider, longer), strict=True)]
+            by_width, by_length = more[-4:-2], more[-2:]
+            more[-6:] = [of + wider * w + longer * l for of, w, l in zip(more[-6:-4], by_width, by_length, strict=True)]
         return value, more
 
     def of_arms(self, arms: tuple[float, ...]) -> Float | float:
