@@ -228,8 +228,6 @@ def _seen_as(sign: int, film: NDArray[Any], seeds: BallFits, pins: list[NeedleFi
         of_tees, needles = optics_of_tees(film, tees, under)
         if len(clear) or needles > balls:
             optics = of_tees
-        if needles > balls:  # and what told of noise under balls may have been arms
-            under = noise_under_needles(film, tees, GUESS, noise)
     if needles <= balls < _ONE_BALL and (not len(clear) or needles == 0):  # where no tee is, clear junctions are something else
         strokes = candidates.strokes[np.sign(candidates.strokes[:, 5]) == -sign]
         more = [p for p in look_for_pins(film, strokes, under) if np.sign(p.depth) == sign]

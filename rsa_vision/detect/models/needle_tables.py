@@ -181,10 +181,11 @@ def table_for(
 
 @lru_cache(maxsize=_KEPT)
 def table(half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str) -> Single:
-    """Opacity and its derivatives by half width and length as the grid stretches with them; then the slopes of the three along and across.
+    """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
-    ``more``: "ends" for derivatives by slant and skew between the two; "optics" for those by the logarithms of attenuation and blur, by
-    the taper, by the curve, by the tail, by what is late and logged and by what is uneven, alone.
+    ``more``: "ends" for derivatives by slant and skew between the two; "exact" for those, and last the slopes of the derivatives by size;
+    "optics" for those by the logarithms of attenuation and blur, by the taper, by the curve, by the tail, by what is late and logged and by
+    what is uneven, alone.
     """
     one = half_width, length, taper, optics, slant
     base = _opacity(*one)
@@ -193,9 +194,9 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
     else:
         wider, longer = _opacity(*one, wider=GRID), _opacity(*one, longer=GRID)
         nodes = [base, (wider - base) / ((GRID - 1) * half_width), (longer - base) / ((GRID - 1) * length)]
-        if more == "ends":
+        if more:
             nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
-        for of in nodes[:3]:
+        for of in nodes[: 3 if more == "exact" else 1]:
             nodes += np.gradient(of, cell_of(optics.sigma_px))
     values = np.array(nodes, np.float32)
     values[:, [0, -1]] = values[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond

@@ -158,14 +158,23 @@ def needle_image(dx: Float, dy: Float, fit: NeedleFit, optics: Optics) -> Float:
 
 
 def arm_images(
-    dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, slants: Float | None = None, *, slopes: bool = True
+    dx: Float,
+    dy: Float,
+    angles: Float,
+    shape: NeedleShape,
+    optics: Optics,
+    slants: Float | None = None,
+    *,
+    slopes: bool = True,
+    exact: bool = False,
 ) -> Float:
     """Opacity of every arm, its derivatives by (tip col, tip row, half width, length), and by its angle; arms along the second axis.
 
-    With slants, those by the slant and by the skew of each arm follow; without slopes, the opacity is all.
+    With slants, those by the slant and by the skew of each arm follow; without slopes, the opacity is all. Derivatives by tip and angle are
+    of the next smaller size that has a table, up to a fifth too flat, if they are not to be exact, as with slants they can be.
     """
     seen = _Seen.of(dx, dy, angles, shape, optics)
-    value, more = seen.values(shape, slants, slopes=slopes)
+    value, more = seen.values(shape, slants, slopes=slopes, exact=exact)
     if not slopes:
         return seen.spread([value])
     more_w, more_l, *more, g_s, g_p = more
@@ -180,12 +189,13 @@ def arm_images(
     return seen.spread([value, g_p * s - g_s * c, -g_s * s - g_p * c, *by_size, d_angle, *more])
 
 
-def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics) -> Float:
+def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, optics: Optics, *, nearest: bool = False) -> Float:
     """Derivatives of every arm by all of an :class:`Optics`, on the first axis; how the ends slant hardly matters.
 
-    In order: logarithms of attenuation and blur, taper, the two of the curve, tail, late, logged, the two of what is uneven.
+    In order: logarithms of attenuation and blur, taper, the two of the curve, tail, late, logged, the two of what is uneven. They are those
+    of the nearest size that has a table, or of the next smaller one.
     """
-    seen = _Seen.of(dx, dy, angles, shape, optics, nearest=True)
+    seen = _Seen.of(dx, dy, angles, shape, optics, nearest=nearest)
     *rows, by_along, by_oblique = seen.looked_up("optics", [0.0] * len(angles))
     c, s = np.cos(2 * angles)[seen.arm], np.sin(2 * angles)[seen.arm]
     return seen.spread([*rows, c * by_along + s * by_oblique, s * by_along - c * by_oblique])
@@ -245,20 +255,20 @@ class _Seen:
         found = [look_up(nodes, self.at_s[i:end], self.at_p[i:end]) for nodes, (i, end) in zip(tables, parts, strict=True)]
         return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
 
-    def values(self, shape: NeedleShape, slants: Float | None, *, slopes: bool) -> tuple[Float, list[Float]]:
+    def values(self, shape: NeedleShape, slants: Float | None, *, slopes: bool, exact: bool = False) -> tuple[Float, list[Float]]:
         """Return the opacity and what else the tables hold."""
-        last = None if slopes else -6
-        if slants is None:
-            value, *more = self.looked_up("", [0.0] * len(self.keys), last)
-        else:
-            off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
-            value, *more = self.looked_up("ends", np.round(slants[0] - off_q, 4).tolist(), last)
-            value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
         wider, longer = shape.half_width_px - self.key[0], shape.length_px * self.of_arms(shape.arms) - self.key[1]
+        if slants is None:
+            value, *more = self.looked_up("", [0.0] * len(self.keys), None if slopes else -2)
+        else:
+            of_table, last = ("exact", -6) if exact else ("ends", -2)
+            off_q = np.where(slants[0] > 0, slants[0] % FINE_Q, slants[0])
+            value, *more = self.looked_up(of_table, np.round(slants[0] - off_q, 4).tolist(), None if slopes else last)
+            value += off_q[self.arm] * more[2] + slants[1][self.arm] * more[3]
+            if slopes and exact:
+                steeper = zip(more[-6:-4], more[-4:-2], more[-2:], strict=True)
+                more[-6:] = [of + wider * by_width + longer * by_length for of, by_width, by_length in steeper]
         value += wider * more[0] + longer * more[1]
-        if slopes:
-            by_width, by_length = more[-4:-2], more[-2:]
-            more[-6:] = [of + wider * w + longer * l for of, w, l in zip(more[-6:-4], by_width, by_length, strict=True)]
         return value, more
 
     def of_arms(self, arms: tuple[float, ...]) -> Float | float:

@@ -330,12 +330,19 @@ def own_parameters(arms: int, parallel: bool) -> int:
 
 def _arms(window: Window, fit: NeedleFit, optics: Optics) -> Float:
     slants = np.zeros((2, len(fit.angles))) if fit.slants is None else fit.slants
-    return arm_images(
-        window.cols - fit.position_px[0], window.rows - fit.position_px[1], fit.angles, fit.shape, fit.seen_by(optics), slants
-    )
+    at = window.cols - fit.position_px[0], window.rows - fit.position_px[1]
+    return arm_images(*at, fit.angles, fit.shape, fit.seen_by(optics), slants, exact=_is_exact(fit))
+
+
+def _is_exact(fit: NeedleFit) -> bool:
+    """Say whether slopes are to be exact: where light is uneven, errors of tees are more than noise makes, and nothing else states them."""
+    return len(fit.angles) == 1
 
 
 def by_optics(window: Window, members: list[NeedleFit], optics: Optics) -> list[NDArray[np.float32]]:
     """Derivatives of each member's arms by what is common, shape (10, k, n), as of :func:`arms_by_optics`; as fine as its tables."""
     offsets = [(window.cols - f.position_px[0], window.rows - f.position_px[1]) for f in members]
-    return [arms_by_optics(*at, f.angles, f.shape, f.seen_by(optics)).astype(np.float32) for at, f in zip(offsets, members, strict=True)]
+    return [
+        arms_by_optics(*at, f.angles, f.shape, f.seen_by(optics), nearest=_is_exact(f)).astype(np.float32)
+        for at, f in zip(offsets, members, strict=True)
+    ]

@@ -60,7 +60,7 @@ _CURVE_ERROR, _CURVE_OF_PINS_ERROR, _TAIL_ERROR = (0.6, 0.1), (1.0, 0.1), 0.07
 _ENOUGH_PINS = 3  # that tell what comes after the film curve
 _PIXEL, _MOST_PIXEL = 1 / 12, 0.5  # px^2 of blur by the area of a scanner's pixel, and part of the variance that it may be at first
 _LATE_ERROR, _LOGGED_ERROR, _FIXED = 0.15, 2.5, 1e-3  # of what comes after the film curve, of the logarithm there, of either where it stays
-_EVEN_ERROR = 0.01  # of what is uneven of the blur, where no first estimate has told something of it: half a step of the grid of tables
+_EVEN_ERROR = 0.02  # of what is uneven of the blur, where no first estimate has told something of it
 # of attenuation, blur, taper, curve, tail, late, logged, uneven: changes from which derivatives by them are taken anew
 _MUCH = np.array([0.15, 0.15, 0.02, 0.1, 0.1, 0.1, 0.1, 0.5, 0.1, 0.1])
 _NEAR = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.1, 0.1, 0.5, 0.1, 0.1])  # changes of those with which the last step gets there
