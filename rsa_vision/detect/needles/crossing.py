@@ -168,13 +168,10 @@ def left_under(window: Window, fits: Sequence[NeedleFit], optics: Optics, noise:
     for f in fits:
         image = needle_image(window.cols - f.position_px[0], window.rows - f.position_px[1], f, optics)
         seen |= np.abs(image) > _FAINTEST * np.abs(image).max(initial=0.0)
+        left, background = _left_by(image, window, weight)
         if optics.proportion:
-            background = (
-                weighted_least_squares(np.concatenate([image[None], window.surface]).T, weight, window.data)[2:] @ window.surface[1:]
-            )
-            image = image * gain_at(f, background, optics)
-        linear = np.concatenate([image[None], window.surface])
-        residuals.append(window.data - weighted_least_squares(linear.T, weight, window.data) @ linear)
+            left, _ = _left_by(image * gain_at(f, background, optics), window, weight)
+        residuals.append(left)
     return np.square(np.array(residuals)[:, seen]) @ weight[seen], int(np.count_nonzero(seen))
 
 
