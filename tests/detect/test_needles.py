@@ -1,6 +1,7 @@
 """The image of a needle: as exact chords make it, thick ends seen at a slant included."""
 
 from collections.abc import Callable
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
 from rsa_vision.detect.models.film_curve import by_film_curve, film_curve, skewness_of_log, slope_of_film_curve
-from rsa_vision.detect.models.needles import NeedleShape, arm_images, arms_by_optics
+from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, arm_images, arms_by_optics
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin
@@ -87,6 +88,25 @@ def test_derivatives_by_what_is_uneven() -> None:
         expected = (high - low).ravel() / (2 * step)
         assert slope @ expected > 0.98 * np.linalg.norm(slope) * np.linalg.norm(expected)
         assert 0.9 < np.linalg.norm(slope) / np.linalg.norm(expected) < 1.1
+
+
+@pytest.mark.parametrize("step", [pytest.param(0.1, id="uneven blur"), pytest.param(0.05, id="blur and attenuation of its own")])
+def test_images_go_on_where_another_table_begins(step: float) -> None:
+    rows, cols = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].reshape(2, -1).astype(float)
+
+    def image(by: float) -> Float:
+        if step == 0.1:
+            optics = Optics(SIGMA, MU, uneven=(by, 0.0))
+        else:
+            fit = NeedleFit(
+                **dict.fromkeys([f.name for f in fields(NeedleFit)], 0.0) | {"blurrier": by, "denser": -by}  # type: ignore[arg-type]
+            )
+            optics = fit.seen_by(Optics(SIGMA, MU))
+        return arm_images(cols, rows, np.array([0.0]), SHAPE, optics)[0, 0]
+
+    below, above, beyond = image(0.499 * step), image(0.501 * step), image(1.499 * step)
+    assert np.linalg.norm(above - below) < 0.15 * np.linalg.norm(beyond - above)  # without what is in between it is as much
+    assert np.abs(above - below).max() < 0.006
 
 
 @pytest.mark.parametrize(

@@ -180,12 +180,14 @@ def table_for(
 
 
 @lru_cache(maxsize=_KEPT)
-def table(half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str) -> Single:
+def table(
+    half_width: float, length: float, taper: float, optics: Optics, slant: float, more: str, own: bool = False, uneven: bool = False
+) -> Single:
     """Opacity and its derivatives by half width and length as the grid stretches with them; then its slopes along and across: first axis.
 
     ``more``: "ends" for derivatives by slant and skew between the two; "exact" for those, and last the slopes of the derivatives by size;
     "optics" for those by the logarithms of attenuation and blur, by the taper, by the curve, by the tail, by what is late and logged and by
-    what is uneven, alone.
+    what is uneven, alone. ``own``, ``uneven``: those by the first two of these, and by the last two, follow the opacity.
     """
     one = half_width, length, taper, optics, slant
     base = _opacity(*one)
@@ -193,10 +195,11 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
         nodes = _by_optics(base, *one)
     else:
         wider, longer = _opacity(*one, wider=GRID), _opacity(*one, longer=GRID)
-        nodes = [base, (wider - base) / ((GRID - 1) * half_width), (longer - base) / ((GRID - 1) * length)]
+        by_size = [(wider - base) / ((GRID - 1) * half_width), (longer - base) / ((GRID - 1) * length)]
+        nodes = [base, *(_by_own(base, *one) if own else []), *(_by_uneven(base, *one) if uneven else []), *by_size]
         if more:
             nodes += [(_opacity(*one[:-1], round(slant + FINE_Q, 4)) - base) / FINE_Q, (_opacity(*one, skew=SKEW) - base) / SKEW]
-        for of in nodes[: 3 if more == "exact" else 1]:
+        for of in [base, *by_size] if more == "exact" else [base]:
             nodes += np.gradient(of, cell_of(optics.sigma_px))
     values = np.array(nodes, np.float32)
     values[:, [0, -1]] = values[:, :, [0, -1]] = 0.0  # the rim stands for all that is beyond
@@ -204,26 +207,34 @@ def table(half_width: float, length: float, taper: float, optics: Optics, slant:
 
 
 def _by_optics(base: Single, half_width: float, length: float, taper: float, optics: Optics, slant: float) -> list[Single]:
-    factor = float(np.exp(STEP))
-    dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
-    wide = _opacity(half_width, length, taper, optics, slant, blurrier=factor)
     short = _opacity(half_width, length, taper - STEP, optics, slant)
-    along, oblique = optics.uneven
     others = [
         replace(optics, tail=optics.tail + STEP),
         replace(optics, late=optics.late + STEP),
         replace(optics, logged=optics.logged + STEP),
-        replace(optics, uneven=(along + STEP, oblique)),
-        replace(optics, uneven=(along, oblique + STEP)),
     ]
-    steps = [(dense - base) / STEP, (wide - base) / STEP, (base - short) / STEP]
+    steps = [*_by_own(base, half_width, length, taper, optics, slant), (base - short) / STEP]
     bow, skewness = optics.curve
     if optics.late:
         others = [replace(optics, curve=(bow + STEP, skewness)), replace(optics, curve=(bow, skewness + STEP)), *others]
     else:  # nothing is blurred after it
         straight = _opacity(half_width, length, taper, replace(optics, curve=(0.0, 0.0), logged=0.0), slant)
         steps += [np.asarray(of, np.float32) for of in by_film_curve(straight, optics.curve)]
-    return [*steps, *((_opacity(half_width, length, taper, other, slant) - base) / STEP for other in others)]
+    steps += [(_opacity(half_width, length, taper, other, slant) - base) / STEP for other in others]
+    return [*steps, *_by_uneven(base, half_width, length, taper, optics, slant)]
+
+
+def _by_own(base: Single, half_width: float, length: float, taper: float, optics: Optics, slant: float) -> list[Single]:
+    factor = float(np.exp(STEP))
+    dense = _opacity(half_width, length, taper, replace(optics, mu_px=optics.mu_px * factor), slant)
+    wide = _opacity(half_width, length, taper, optics, slant, blurrier=factor)
+    return [(dense - base) / STEP, (wide - base) / STEP]
+
+
+def _by_uneven(base: Single, half_width: float, length: float, taper: float, optics: Optics, slant: float) -> list[Single]:
+    along, oblique = optics.uneven
+    others = (replace(optics, uneven=(along + STEP, oblique)), replace(optics, uneven=(along, oblique + STEP)))
+    return [(_opacity(half_width, length, taper, other, slant) - base) / STEP for other in others]
 
 
 def look_up(values: Single, at_s: Float, at_p: Float) -> Float:

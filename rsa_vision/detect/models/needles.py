@@ -17,8 +17,9 @@ from rsa_vision.detect.models.needle_tables import FINE_Q, LOG_GRID, Key, cell_o
 from rsa_vision.detect.models.profiles import Optics
 from rsa_vision.types import Bool, Float, Int
 
-_OWN_GRID = 0.002  # of the logarithms of a needle's own blur and attenuation
-_UNEVEN_GRID = 0.02  # between what is uneven, of the blur of an arm, that has tables of its own
+# between what has tables of its own: logarithms of a needle's own attenuation and blur, and what is uneven of the blur of an arm; an image
+# is linear in between, to a thousandth of the depth
+_OWN_GRID, _UNEVEN_GRID = 0.05, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +105,12 @@ class NeedleFit:
         return np.array([np.cos(self.angles[0]), -np.sin(self.angles[0])])
 
     def seen_by(self, optics: Optics) -> Optics:
-        """Return a film's optics with the blur and the attenuation of this needle, on a grid that has tables of its own."""
-        blurrier, denser = (_OWN_GRID * round(own / _OWN_GRID) for own in (self.blurrier, self.denser))
-        if not (blurrier or denser):
+        """Return a film's optics with the attenuation and the blur of this needle: on a grid that has tables of its own, and off it."""
+        denser, blurrier = (_OWN_GRID * round(own / _OWN_GRID) for own in (self.denser, self.blurrier))
+        if not (self.denser or self.blurrier):
             return optics
-        return replace(optics, sigma_px=optics.sigma_px * math.exp(blurrier), mu_px=optics.mu_px * math.exp(denser))
+        mu, sigma = optics.mu_px * math.exp(denser), optics.sigma_px * math.exp(blurrier)
+        return replace(optics, mu_px=mu, sigma_px=sigma, own=(self.denser - denser, self.blurrier - blurrier))
 
 
 def unexplained(fit: NeedleFit) -> float:
@@ -201,11 +203,12 @@ def arms_by_optics(dx: Float, dy: Float, angles: Float, shape: NeedleShape, opti
     return seen.spread([*rows, c * by_along + s * by_oblique, s * by_along - c * by_oblique])
 
 
-def _of_arm(uneven: tuple[float, float], angle: float) -> tuple[float, float]:
-    """What is uneven of a film's blur along an arm against across, and the covariance of both, on the grid of tables."""
+def _of_arm(uneven: tuple[float, float], angle: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What is uneven of a film's blur along an arm against across, and the covariance of both: on the grid of tables, and off it."""
     c, s = math.cos(2 * angle), math.sin(2 * angle)
-    seen = uneven[0] * c + uneven[1] * s, uneven[0] * s - uneven[1] * c
-    return round(_UNEVEN_GRID * round(seen[0] / _UNEVEN_GRID), 4), round(_UNEVEN_GRID * round(seen[1] / _UNEVEN_GRID), 4)
+    along, oblique = uneven[0] * c + uneven[1] * s, uneven[0] * s - uneven[1] * c
+    near = (round(_UNEVEN_GRID * round(along / _UNEVEN_GRID), 4), round(_UNEVEN_GRID * round(oblique / _UNEVEN_GRID), 4))
+    return near, (along - near[0], oblique - near[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,6 +220,8 @@ class _Seen:
 
     key: Key
     keys: list[Key]  # of each arm: of blur that is not even they see different parts
+    own: tuple[float, float]  # attenuation and blur off those of the tables
+    off: list[tuple[float, float]]  # what the blur of each is uneven by off its table, along and oblique; empty where it is even
     first: tuple[float, float]
     cell_s: float  # stretched, for an arm of the common length
     cell_p: float
@@ -241,19 +246,25 @@ class _Seen:
         within = (np.abs(at_s - middle[0]) < reach[0]) & (np.abs(at_p - middle[1]) < reach[1])
         index = np.flatnonzero(within)
         at = at_s.ravel().take(index), at_p.ravel().take(index)
-        keys = [key] * len(angles)
-        if max(map(abs, optics.uneven)) > _UNEVEN_GRID / 2:
-            keys = [(*key[:3], replace(key[3], uneven=_of_arm(optics.uneven, angle))) for angle in angles.tolist()]
-        return _Seen(key, keys, first, cell_s, cell_p, index // len(dx), *at, index, within.shape)
+        keys, off = [key] * len(angles), list[tuple[float, float]]()
+        if any(optics.uneven):
+            near, off = map(list, zip(*(_of_arm(optics.uneven, angle) for angle in angles.tolist()), strict=True))
+            keys = [(*key[:3], replace(key[3], uneven=of)) for of in near]
+        return _Seen(key, keys, optics.own, off, first, cell_s, cell_p, index // len(dx), *at, index, within.shape)
 
-    def looked_up(self, more: str, slants: list[float], last: int | None = None) -> Float:
+    def looked_up(self, more: str, slants: list[float], last: int | None = None) -> list[Float]:
         """Interpolate the tables of the arms; most share one with the arm before."""
         asked = list(zip(self.keys, slants, strict=True))
         first = [0, *(k for k in range(1, len(asked)) if asked[k] != asked[k - 1])]
         parts = pairwise([*np.searchsorted(self.arm, first).tolist(), len(self.arm)])
-        tables = [table(*asked[k][0], asked[k][1], more)[:last] for k in first]
+        own, uneven = (any(self.own), bool(self.off)) if more != "optics" else (False, False)
+        tables = [table(*asked[k][0], asked[k][1], more, own, uneven)[:last] for k in first]
         found = [look_up(nodes, self.at_s[i:end], self.at_p[i:end]) for nodes, (i, end) in zip(tables, parts, strict=True)]
-        return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
+        value, *rows = found[0] if len(found) == 1 else np.concatenate(found, axis=1)
+        off = [*(self.own if own else ()), *(map(self.of_arms, zip(*self.off, strict=True)) if uneven else ())]
+        for by, row in zip(off, rows, strict=False):
+            value += by * row
+        return [value, *rows[len(off) :]]
 
     def values(self, shape: NeedleShape, slants: Float | None, *, slopes: bool, exact: bool = False) -> tuple[Float, list[Float]]:
         """Return the opacity and what else the tables hold."""

@@ -56,6 +56,8 @@ class Optics:
     bend : float
         Of the film curve, as ``curve[0]``, with the skewness of a logarithm where it is negative: what single balls show of it beside
         attenuation. Balls only.
+    own : tuple of float
+        Logarithms of the attenuation and the blur of one pin or tee over these: so near to them that its image is linear in both.
     rough : bool
         The blur is a guess to improve upon.
     """
@@ -69,6 +71,7 @@ class Optics:
     proportion: float = 0.0
     uneven: tuple[float, float] = (0.0, 0.0)
     bend: float = 0.0
+    own: tuple[float, float] = (0.0, 0.0)
     rough: bool = False
 
     def pooled(self, side: int) -> Optics:
