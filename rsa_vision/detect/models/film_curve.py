@@ -31,7 +31,8 @@ def curve_of_bend(bend: float) -> tuple[float, float]:
 
 def film_curve(opacity: NDArray[Any], curve: tuple[float, float]) -> Float:
     """What film shows of blurred opacities, by the two coefficients of :attr:`Optics.curve`."""
-    return np.asarray(_shifted(opacity, curve[0]) + curve[1] * _skew(opacity, curve))
+    shifted = _shifted(opacity, curve[0])
+    return np.asarray(shifted + curve[1] * _skew(opacity, shifted, curve)) if curve[1] else shifted
 
 
 def by_film_curve(opacity: NDArray[Any], curve: tuple[float, float]) -> list[Float]:
@@ -40,10 +41,10 @@ def by_film_curve(opacity: NDArray[Any], curve: tuple[float, float]) -> list[Flo
     shifted = _shifted(opacity, bend)
     bow = shifted * (1 - shifted)
     if not _is_logged(curve):
-        return [bow * (1 + skewness * (1 - 6 * bow)), _skew(opacity, curve)]
+        return [bow * (1 + skewness * (1 - 6 * bow)), _skew(opacity, shifted, curve)]
     within, factor = np.clip(opacity, 0.0, 1.0), math.expm1(2 * bend)
     by_bend = ((factor + 1) * within / (1 + factor * within) - np.log1p(factor * within) / (2 * bend)) / bend
-    skew = _skew(opacity, curve)
+    skew = _skew(opacity, shifted, curve)
     return [bow + skewness * ((by_bend - bow) / skewness_of_log(bend) - 2 * skew / bend), skew]
 
 
@@ -65,20 +66,23 @@ def _is_logged(curve: tuple[float, float]) -> bool:
 def _shifted(opacity: NDArray[Any], by: float) -> Float:
     """Opacities whose log odds are by so much more; those of overshoots, which have none, go on straight."""
     within = np.asarray(np.clip(opacity, 0.0, 1.0), np.float64)
-    beyond = opacity - within
     factor = math.exp(by)
-    return np.asarray(within / (within + (1 - within) / factor) + beyond * np.where(beyond < 0, factor, 1 / factor))
+    shifted = within / (within + (1 - within) / factor)
+    beyond = opacity - within
+    return np.asarray(shifted + beyond * np.where(beyond < 0, factor, 1 / factor)) if beyond.any() else shifted
 
 
-def _skew(opacity: NDArray[Any], curve: tuple[float, float]) -> Float:
+def _skew(opacity: NDArray[Any], shifted: Float, curve: tuple[float, float]) -> Float:
     """What a skewness of one adds to the shift: zero at either end."""
-    bend, shifted = curve[0], _shifted(opacity, curve[0])
+    bend = curve[0]
     if not _is_logged(curve):
         return np.asarray(shifted * (1 - shifted) * (1 - 2 * shifted))
     within = np.asarray(np.clip(opacity, 0.0, 1.0), np.float64)
     logged = np.log1p(math.expm1(2 * bend) * within) / (2 * bend)
-    straight_on = (opacity - within) * _slope_of_log_skew(within, bend)
-    return np.asarray((logged - _shifted(within, bend)) / skewness_of_log(bend) + straight_on)
+    beyond = opacity - within
+    if not beyond.any():
+        return np.asarray((logged - shifted) / skewness_of_log(bend))
+    return np.asarray((logged - _shifted(within, bend)) / skewness_of_log(bend) + beyond * _slope_of_log_skew(within, bend))
 
 
 def _slope_of_shift(within: Float, bend: float) -> Float:
