@@ -109,7 +109,7 @@ def _unblurred(
     )
     fine_s, fine_p = ((at[:, None] + step * (np.arange(2) - 0.5) / 2).ravel() for at, step in ((s[rows], cell_s), (p[cols], cell_p)))
     width = half_width * np.clip(fine_s[:, None] / (taper * length), 0.0, 1.0)
-    chord = 2 * np.sqrt(np.maximum(width**2 - fine_p**2, 0.0))
+    chord = _mean_chord(width, np.append(fine_p, fine_p[-1] + cell_p / 2) - cell_p / 4)
     before = length - fine_s[:, None] - skew * fine_p
     if slant:
         chord *= np.clip(0.5 + before / (np.sqrt(slant) * np.maximum(chord, 1e-9)), 0.0, 1.0)
@@ -117,6 +117,13 @@ def _unblurred(
     opacity = np.zeros((n_s, len(p)), np.float32)
     opacity[rows, cols] = (fine[::2, ::2] + fine[1::2, ::2] + fine[::2, 1::2] + fine[1::2, 1::2]) / 4
     return opacity
+
+
+def _mean_chord(width: Single, edges: Single) -> Single:
+    """Mean chord between these places across circles: one in the middle, where the rim lies between, is too long or none."""
+    within = np.clip(edges, -width, width)
+    area = within * np.sqrt(width**2 - within**2) + width**2 * np.arcsin(within / np.maximum(width, np.float32(1e-9)))
+    return np.asarray(np.diff(area, axis=1) / np.diff(edges))
 
 
 def _blurred_late(shown: Single, logged: float, light: tuple[float, float, float, float], *, mirrored: bool) -> Single:
