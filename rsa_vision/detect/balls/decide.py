@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, EXPLAINED, MISFIT, SURE, misfit, plausible
+from rsa_vision.detect.balls.find import CHANCE, DOUBTFUL, EXPLAINED, MISFIT, QUIET, SURE, misfit, plausible
 from rsa_vision.detect.balls.fits import RADIUS_PX, BallFits
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.models.needles import NeedleFit
@@ -12,7 +12,6 @@ from rsa_vision.types import Bool, Float
 
 ALONE = 10.0  # the same for marks of which there are not enough to tell what they are like
 _AMONG_MOTTLE = 20.0  # and those on films of which the other polarity shows nearly as much
-_QUIET = 1.25  # less variance than this around a ball, in units of the noise, is noise: chance excuses what such a ball leaves
 CLOSE = 0.96  # part of the variance that the model explains of a ball that may stand as a pattern for others
 FAINT = 0.1  # marks of one film are at least so high against the typical one, whatever lies over them
 _LOST = 0.75  # of that, below which a first fit is too low for a mark
@@ -132,7 +131,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
         whole = sure & (misfit(fits, noise, CHANCE) < MISFIT)  # mottle and the crossings of ribs and vessels leave more than noise
         spread = _spread(fits, sigma_px)
         known = whole & (_of_like_spread(spread, whole) >= _COMPANY) & (not mottled)
-        fair = whole & (close | ((fits.chi2_ring < _QUIET) & (not mottled))) & ~_soft_shadows(fits.radius_px, height, known)
+        fair = whole & (close | ((fits.chi2_ring < QUIET) & (not mottled))) & ~_soft_shadows(fits.radius_px, height, known)
         alone = fair & (strength > (_AMONG_MOTTLE if mottled else ALONE))
         among = fair & (_of_like_spread(spread, alone) >= LEAST_KNOWN) & (not mottled)
         if plain:
@@ -151,7 +150,7 @@ def are_balls(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel, 
     low, high = _SMALLER * float(radii.min()), _LARGER * float(radii.max())
     alike = (pattern | ((fits.radius_px > low) & (fits.radius_px < min(high, RADIUS_PX[1])))) & high_enough
     if not mottled:  # smaller ones may be too faint for a pattern; where all around is noise, several of one size are marks as well
-        quiet = sure & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.chi2_ring < _QUIET) & (strength > ALONE)
+        quiet = sure & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.chi2_ring < QUIET) & (strength > ALONE)
         alike |= quiet & (fits.radius_px < high) & (_of_like_spread(_spread(fits, sigma_px), quiet) >= LEAST_KNOWN)
     return np.asarray((fits.significance > limit) & seen & alike & (sure | (strength > 0.5 * SURE)))
 
@@ -162,7 +161,7 @@ def above_noise(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel
     Where neighbours share noise, or marks are small, none stands out far. But of noise, or mottle, there is the more the less significant.
     """
     height = height_of(fits, sigma_px)
-    even = (fits.chi2_ring < _QUIET) & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.radius_px < RADIUS_PX[1])
+    even = (fits.chi2_ring < QUIET) & (misfit(fits, noise, CHANCE) < MISFIT) & (fits.radius_px < RADIUS_PX[1])
     above = even & (fits.significance > limit)
     below = even & ~above & (fits.significance > _NEARLY * limit)
     if np.count_nonzero(above) < _MANY:

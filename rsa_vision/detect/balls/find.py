@@ -28,6 +28,7 @@ MISFIT = 0.09  # model errors beyond the noise, RMS over depth, that a tantalum 
 DOUBTFUL = 0.6  # of it: more may be two balls, or something else
 ANYTHING = 6.0  # times the misfit that is tolerated otherwise, which pairs leave that hardly lap
 CHANCE = 4.0  # standard deviations of the mean square of noise, for which no mark is blamed
+QUIET = 1.25  # less variance than this around a ball, in units of the noise, is noise: chance excuses what such a ball leaves
 EXPLAINED = 0.9
 _PROMISING = 0.85  # of the significance a mark must have: better fits are 3 % more significant mostly, 10 % at the most
 SURE = 9.0  # significance over clutter that trabeculae and soft shadows seldom reach; tantalum mostly does
@@ -126,7 +127,8 @@ def plausible(fits: BallFits, noise: NoiseModel, slack: float = 1.0) -> Bool:
     # of a weak image noise leaves more than a tenth; that it is a ball is then told by how far it stands out of all around it
     least = 1 - (1 - EXPLAINED) * slack
     stands_out = fits.significance / np.sqrt(np.maximum(fits.chi2_ring, 1.0)) > STANDS_OUT
-    explained = (fits.explained > least) | ((explained_over_noise(fits) > least) & stands_out)
+    by_chance = np.where(fits.chi2_ring < QUIET, CHANCE * noise.scatter(fits.n_core), 0.0)
+    explained = (fits.explained > least) | ((explained_over_noise(fits, by_chance) > least) & stands_out)
     return usable & (left < MISFIT * slack) & explained & (fits.significance > 5.0)
 
 
@@ -161,11 +163,14 @@ def promising(fits: BallFits, limit: float, sigma_px: float, noise: NoiseModel) 
     return np.asarray(in_correlated_noise(fits, sigma_px, noise) > _PROMISING * limit)
 
 
-def explained_over_noise(fits: BallFits) -> Float:
-    """Return the part of the excess over the noise under each ball that the ball explains, shape (n,)."""
+def explained_over_noise(fits: BallFits, by_chance: Float | float = 0.0) -> Float:
+    """Return the part of the excess over the noise under each ball that the ball explains, shape (n,).
+
+    ``by_chance``: of what it leaves, in units of the noise, so much more than the noise does not count.
+    """
     left = fits.chi2_core
     raised = left / np.maximum(1.0 - fits.explained, 1e-9)
-    out: Float = 1.0 - np.maximum(left - 1.0, 0.0) / np.maximum(raised - 1.0, 1e-9)
+    out: Float = 1.0 - np.maximum(left - 1.0 - by_chance, 0.0) / np.maximum(raised - 1.0, 1e-9)
     return np.where(raised > 1.0, out, 0.0)
 
 
