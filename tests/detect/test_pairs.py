@@ -60,6 +60,20 @@ def test_pairs_that_noise_does_not_let_tell_apart_pass_for_no_single_balls() -> 
         assert max(square, default=0.0) < 25.0
 
 
+@pytest.mark.parametrize("cnr", [10.0, 20.0])
+def test_of_many_small_pairs_none_passes_for_a_single_ball(cnr: float) -> None:
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        middle, _ = grid_of_balls(rng, 7, 110.0, (2.5, 2.5))
+        angle = rng.uniform(0, np.pi, len(middle))
+        half = 0.5 * 2.5 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        truth, shape = np.concatenate([middle - half, middle + half]), (840, 840)
+        sd, radius = DEPTH / cnr * BACKGROUND, np.full(2 * len(middle), 2.5)
+        film = film_of_balls(shape, truth, radius, background=BACKGROUND, depth=DEPTH, sigma_px=1.3, noise_sd=sd, rng=rng)
+        _, square = surely(detect_markers(stored(film), bits=16).images, truth)
+        assert max(square, default=0.0) < 25.0
+
+
 @pytest.mark.parametrize(("radius_px", "seed"), [(6.0, 7), (6.0, 8), (6.0, 11), (3.0, 4), (3.0, 11)])
 def test_pairs_that_hardly_lap_and_look_like_no_ball_are_found_where_there_is_nothing_else(radius_px: float, seed: int) -> None:
     film, truth = film_of_pairs(seed, radius_px, 0.8, 10.0)

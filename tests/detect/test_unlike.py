@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rsa_vision.detect import detect_markers
-from rsa_vision.detect.balls.unlike import of_odd_size, too_deep, too_pale
+from rsa_vision.detect.balls.unlike import like_poor_ones, of_odd_size, too_deep, too_pale
 from rsa_vision.detect.models.needles import NeedleFit, NeedleShape
 from rsa_vision.detect.needles.arms import badly_placed, lone_tees
 from rsa_vision.detect.needles.fits import unfit
@@ -169,3 +169,13 @@ def test_a_tee_whose_place_is_known_badly_though_it_stands_high_above_noise_is_n
     covariance = np.array([0.02, 0.02, 0.3, 0.3, np.nan])[:, None, None] ** 2 * np.eye(2)
     snr = np.array([200.0, 20.0, 20.0, 200.0, 200.0])
     assert badly_placed(covariance, np.full(5, 2.0), snr).tolist() == [False, False, False, True, False]
+
+
+def test_what_is_like_many_that_are_poorly_described_is_no_surer() -> None:
+    size = np.array([3.2] * 9 + [2.5] * 8 + [3.25, 4.5])
+    depth = np.full(len(size), -9000.0)
+    poor = np.arange(len(size)) < 9
+    told = like_poor_ones(size, depth, poor)
+    assert np.flatnonzero(told).tolist() == [17]
+    assert not like_poor_ones(size, np.where(np.arange(len(size)) == 17, -2e4, depth), poor).any()  # another depth
+    assert not like_poor_ones(size, depth, poor & (np.arange(len(size)) < 5)).any()  # too few, and others of the size that are described

@@ -12,6 +12,7 @@ COMPANY = 6  # marks of one kind that tell what is unlike them
 _ALIKE, _APART = 0.035, 3.0  # of radii of one kind, where curve and background differ; standard deviations
 _ALONE, _SURELY_ALONE = 0.1, 2.0  # logarithm, and standard deviations, by which not one other has the size of what is alone: two in one
 _SMALL, _FEW, _TIMES = 0.65, 6, 3  # of the usual size; fewer have that, and so many times as many do not: dust, dots of a date
+_OF_ONE_SIZE, _OF_ONE_DEPTH, _MOST = 0.1, 0.4, 0.8  # logarithms; part of those like one, beyond which they tell what it is
 _BESIDE = 5  # known balls nearest in background, on either side
 _ENOUGH = 3  # of them, whose median is theirs
 _SCATTERED = 0.6  # the part of one and the same film value that is primary radiation differs by no more: from 0.5 to 0.8 of it
@@ -45,6 +46,31 @@ def of_odd_size(size_px: Float, variance_px2: Float, alike: float = _ALIKE) -> B
     small = size < np.log(_SMALL) + size[company.argmax()]
     fellows = (differ < -np.log(_SMALL)).sum(axis=1)
     return np.asarray((company < LEAST_KNOWN) | alone | (small & (fellows < _FEW) & (_TIMES * fellows <= np.count_nonzero(~small))))
+
+
+def like_poor_ones(size_px: Float, depth: Float, poor: Bool) -> Bool:
+    """Say which balls are like many that the model does not describe, and like hardly any others: noise hides what they leave.
+
+    Two balls that lie over each other have the size of no single one; where most of them are seen to be no ball, one that is not is none.
+
+    Parameters
+    ----------
+    size_px : ndarray of shape (n,)
+        Radii.
+    depth : ndarray of shape (n,)
+        In film values.
+    poor : ndarray of bool, shape (n,)
+        Not described.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        None of those.
+    """
+    size, deep = np.log(size_px), np.log(np.maximum(np.abs(depth), 1e-9))
+    alike = (np.abs(size[:, None] - size) < _OF_ONE_SIZE) & (np.abs(deep[:, None] - deep) < _OF_ONE_DEPTH)
+    of_poor = (alike & poor).sum(axis=1)
+    return np.asarray(~poor & (of_poor >= COMPANY) & (of_poor > _MOST * (alike.sum(axis=1) - 1)))
 
 
 def too_pale(depth: Float, variance: Float, background: Float, known: Bool) -> Bool:

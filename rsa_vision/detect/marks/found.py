@@ -14,7 +14,7 @@ from rsa_vision.detect.balls.find import DOUBTFUL, MISFIT, ROUNDNESS, distinct, 
 from rsa_vision.detect.balls.fits import BallFits, join
 from rsa_vision.detect.balls.leftover import noise_under
 from rsa_vision.detect.balls.surroundings import Places, free_places
-from rsa_vision.detect.balls.unlike import of_odd_size
+from rsa_vision.detect.balls.unlike import like_poor_ones, of_odd_size
 from rsa_vision.detect.film.noise import NoiseModel
 from rsa_vision.detect.film.places import are_within, gaps
 from rsa_vision.detect.marks.beaded import find_beaded
@@ -343,6 +343,7 @@ def _measured(
     added = added[np.append(keep, np.ones(len(others), bool))]
     one, other = lapping_balls(balls)
     poor |= rowed | np.isin(np.arange(len(poor)), one[poor[other]])  # what one of them leaves may be another's
+    poor |= like_poor_ones(balls.radius_px, balls.depth, poor & ~rowed)
     doubtful = rowed | strokes | like_those_in_rows(balls.position_px, balls.radius_px, balls.depth, rowed, poor)
     doubtful |= in_bars(balls.position_px, balls.radius_px, balls.depth)
     doubtful |= cut_from_outlines(touching, ends[keep]) | are_holes(film, balls, optics.sigma_px)

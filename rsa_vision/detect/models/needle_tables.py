@@ -119,10 +119,10 @@ def _unblurred(
     return opacity
 
 
-def _mean_chord(width: Single, edges: Single) -> Single:
+def _mean_chord(width: Float, edges: Float) -> Float:
     """Mean chord between these places across circles: one in the middle, where the rim lies between, is too long or none."""
     within = np.clip(edges, -width, width)
-    area = within * np.sqrt(width**2 - within**2) + width**2 * np.arcsin(within / np.maximum(width, np.float32(1e-9)))
+    area = within * np.sqrt(width**2 - within**2) + width**2 * np.arcsin(within / np.maximum(width, 1e-9))
     return np.asarray(np.diff(area, axis=1) / np.diff(edges))
 
 
