@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from rsa_vision.detect import detect_markers
 from rsa_vision.detect.balls.unlike import like_poor_ones, of_odd_size, too_deep, too_pale
@@ -179,3 +180,18 @@ def test_what_is_like_many_that_are_poorly_described_is_no_surer() -> None:
     assert np.flatnonzero(told).tolist() == [17]
     assert not like_poor_ones(size, np.where(np.arange(len(size)) == 17, -2e4, depth), poor).any()  # another depth
     assert not like_poor_ones(size, depth, poor & (np.arange(len(size)) < 5)).any()  # too few, and others of the size that are described
+
+
+@pytest.mark.parametrize(("stroke_px", "half_px", "stem_px"), [(6, 14, 28), (7, 16, 30), (8, 14, 28), (8, 16, 30)])
+@pytest.mark.parametrize("seed", range(2))
+def test_lead_letters_whose_strokes_meet_are_no_tees(seed: int, stroke_px: int, half_px: int, stem_px: int) -> None:
+    rng, fine, side = np.random.default_rng(seed), 4, 320
+    light = np.zeros((side * fine, side * fine))
+    for place in np.array([[60.0, 70.0], [220.0, 70.0], [60.0, 220.0], [220.0, 220.0]]) + rng.uniform(-20, 20, (4, 2)):
+        col, row = (fine * place).astype(int)
+        half, stroke = fine * half_px, fine * stroke_px // 2
+        light[row - stroke : row + stroke, col - half : col + half] = 1.0
+        light[row : row + fine * stem_px, col - stroke : col + stroke] = 1.0
+    opacity = gaussian_filter(light, 0.9 * fine).reshape(side, fine, side, fine).mean((1, 3))
+    film = 30000 * (1 - 0.6 * opacity) + rng.normal(0, 140, (side, side))
+    assert (detect_markers(stored(film), bits=16).images.flags != 0).all()

@@ -31,6 +31,8 @@ WHOLE, CUT_OFF = 0.999, 0.8  # part of the pixels under a ball
 NEEDLES_ALIKE = 0.12  # of the logarithms of their half widths, as magnification, slant and film curve make them
 _BLURRED = 2.0  # blur widths to which an image goes beyond its ball
 _BLUNT = 1.01 * LEAST_TAPER  # needles that are no more pointed than a fit lets them be have no tip
+# points over half their width, of what has none: any, and tees that leave so much of their depth, as strokes of letters do that meet
+_RIGHT_ANGLE, _SHORT_POINT, _OF_STROKES = 1.0, 2.0, 0.02
 _SEVERAL = 5  # tees that tell of all
 _LOST = 0.3  # of the radius: larger standard deviations are of what lies beside an image, which is hardly told from it
 _SOMEWHERE = 0.1  # of the squared radius: variance of a centre whose image the model does not describe
@@ -138,8 +140,11 @@ def table_of(
     snr = depth / np.sqrt(noise.variance_at(background))
     flags[n:][(arms == 3) & badly_placed(covariance[n:], radius[n:], snr[n:])] |= MarkerFlag.UNLIKE
     flags[n:][perhaps_arms(needles, junctions) | meet_others(film, needles) | (radius[n:] <= LINE_PX)] |= MarkerFlag.UNLIKE
-    flags[n:][[t.shape.taper <= _BLUNT for t in needles]] |= MarkerFlag.UNLIKE
-    poor = np.concatenate([poor_ball, np.array([significant_misfit(t, noise) for t in needles]) > DOUBTFUL * MISFIT])
+    misfit_of = np.array([significant_misfit(t, noise) for t in needles])
+    point = np.array([t.shape.taper * t.shape.length_px / t.shape.half_width_px for t in needles])
+    blunt = np.array([t.shape.taper <= _BLUNT for t in needles], bool) | (point < _RIGHT_ANGLE)
+    flags[n:][blunt | ((arms == 3) & (point < _SHORT_POINT) & (misfit_of > _OF_STROKES))] |= MarkerFlag.UNLIKE
+    poor = np.concatenate([poor_ball, misfit_of > DOUBTFUL * MISFIT])
     if np.count_nonzero(arms == 3) >= _SEVERAL and poor[n:][arms == 3].mean() > 0.5:  # what most of them are not, none is for sure
         flags[n:][arms == 3] |= MarkerFlag.UNLIKE
     if n >= COMPANY:  # among balls a pin or two are more likely ends of rods, and a tee or two are letters of lead
