@@ -334,3 +334,13 @@ def test_pins_that_begin_at_one_place_may_be_arms_of_a_tee() -> None:
     width = 2 * pin.shape.half_width_px
     other, third = (replace(pin, angles=np.zeros(1), position_px=np.array([50.0 + by * width, 50.0])) for by in (0.9, 3.0))
     assert perhaps_arms([pin, other, third], np.zeros((0, 5))).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("gap", "turn", "told"), [(0.4, 0.0, True), (0.4, 0.15, True), (0.4, 0.5, False), (0.8, 0.0, False), (-0.4, 0.0, False)]
+)
+def test_pins_that_face_each_other_across_a_gap_may_be_arms_of_a_tee(gap: float, turn: float, told: bool) -> None:
+    pin = replace(_TEE, angles=np.zeros(1), depths=np.full(1, -900.0), position_px=np.array([50.0, 50.0]))
+    across = np.array([-gap * pin.shape.length_px, 0.0])  # of the other tip, which lies before this one's
+    other = replace(pin, angles=np.array([np.pi + turn]), position_px=pin.position_px + across)
+    assert perhaps_arms([pin, other], np.zeros((0, 5))).tolist() == [told, told]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
@@ -14,6 +15,7 @@ from rsa_vision.detect.needles.pointed import LEAST_OF_A_KIND
 from rsa_vision.types import Bool, Float
 
 _FEW_PINS, _PARALLEL = 3, 0.25  # times as many tees as pins, beside which these may be what is seen of a tee; radians
+_GAP = 0.6  # of their length, between tips of arms of which film hides the middle
 _AT_TIP = 0.35  # of a pin's length, from its tip to where three arms meet
 _AWAY = np.array([0.35, 0.5, 0.65])  # of a pin's length from its tip, where another is sought
 _AS_WIDE = 0.35  # logarithms of the half widths of the tees of a set, which stand for depth
@@ -27,13 +29,13 @@ _AS_HIGH = 0.5  # of the pin's own height there
 def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
     """Say which pins may be what is seen of a tee: an edge may hide the rest.
 
-    Those at whose tips three arms meet, one of them along the pin, those that begin at one place, and those parallel to an arm of the
-    nearest tee, where they are few.
+    Those at whose tips three arms meet, one of them along the pin, those that begin at one place or point at each other's tips across a
+    gap, where film may show nothing of three, and those parallel to an arm of the nearest tee, where they are few.
     """
     pin = np.array([len(f.angles) == 1 for f in needles], bool)
     tip, half = np.array([f.position_px for f in needles]).reshape(-1, 2), np.array([f.shape.half_width_px for f in needles])
     together = pin & pin[:, None] & (gaps(tip, tip) < half + half[:, None])
-    out = np.asarray(together.sum(axis=1) > 1)  # a pin is at its own place
+    out = np.asarray(together.sum(axis=1) > 1) | (pin & _face_others(needles))  # a pin is at its own place
     tees = [f for f, single in zip(needles, pin, strict=True) if not single]
     place = np.array([t.position_px for t in tees]).reshape(-1, 2)
     few = 0 < np.count_nonzero(pin) * _FEW_PINS <= len(tees)
@@ -45,6 +47,17 @@ def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
             arms = np.append(arms, tees[int(np.hypot(*(place - tip[k]).T).argmin())].angles)
         out[k] |= np.abs(wrapped(arms - angle)).min(initial=np.inf) < _PARALLEL
     return out
+
+
+def _face_others(needles: list[NeedleFit]) -> Bool:
+    """Say which have in front of their tips that of another that points at theirs."""
+    tip, way = np.array([[f.position_px, f.way] for f in needles]).reshape(-1, 2, 2).transpose(1, 0, 2)
+    length = np.array([f.shape.length_px for f in needles])
+    gap = tip - tip[:, None]
+    apart = np.hypot(*gap.transpose(2, 0, 1))
+    ahead = -(way[:, None] * gap).sum(axis=2) > math.cos(_PARALLEL) * apart
+    near = (apart > 0) & (apart < _GAP * np.minimum(length, length[:, None]))
+    return np.asarray((near & ahead & ahead.T).any(axis=1))
 
 
 def meet_others(film: NDArray[Any], needles: list[NeedleFit]) -> Bool:
