@@ -88,6 +88,16 @@ def test_tees_that_point_anywhere_are_tees(count: int) -> None:
         check(detect_markers(film, bits=16).images, tips, list(range(count)))
 
 
+def test_twins_that_come_together_are_one() -> None:
+    faint, near, other = (
+        replace(_TEE, position_px=np.array([by, 0.0]), depth=of) for by, of in ((0.0, -400.0), (0.5, -600.0), (2.0, -500.0))
+    )
+    kept = tees._one_each([faint, near, other])
+    assert len(kept) == 2
+    assert kept[0] is near
+    assert kept[1] is other
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_blur_comes_from_clean_tees_where_crossing_arms_look_stronger(seed: int) -> None:
     rng = np.random.default_rng(seed)

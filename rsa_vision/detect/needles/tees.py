@@ -28,7 +28,7 @@ from rsa_vision.detect.needles.optics import BLURS_PX, GUESS, common_optics
 from rsa_vision.detect.needles.sets import MOST_TOGETHER, NEAREST_PX, TAPERS, fit_all, is_apart, others_beside
 from rsa_vision.detect.needles.shared import fit_shared
 from rsa_vision.detect.needles.templates import SCALE, find_like, template_of, worth_a_fit
-from rsa_vision.detect.needles.twins import split_twins
+from rsa_vision.detect.needles.twins import APART_PX, split_twins
 from rsa_vision.detect.search.junctions import ALONE, RINGS_PX
 from rsa_vision.types import Float
 
@@ -130,6 +130,8 @@ def _found_from(
     tees, optics = tees_beside_edges(film, tees, optics, noise, is_tee)
     nearly = [t for t in tees if is_tee(t, slack=_BEFORE)]
     fitted, optics = fit_shared(film, nearly, optics, noise, parallel=len(nearly) >= _LEAST_PARALLEL)
+    if len(one_each := _one_each(fitted)) < len(fitted):
+        fitted, optics = fit_shared(film, one_each, optics, noise, parallel=len(one_each) >= _LEAST_PARALLEL)
     others = [t for t in tees if not is_tee(t, slack=_BEFORE)]
     bare, fitted, optics = _undisturbed(film, fitted, optics, noise)
     clean = [t for t in fitted if is_tee(t)]
@@ -142,6 +144,15 @@ def _found_from(
     slack = _BEFORE if len(clean) >= _LEAST_PARALLEL else 1.0  # of what is parallel to others, and as large, bone may leave more
     others += [replace(t, slants=None) for t in fitted if not is_tee(t, slack)]
     return [t for t in fitted if is_tee(t, slack)], [t for t in others if is_tee(t, slack=ROUGH)], optics
+
+
+def _one_each(tees: list[NeedleFit]) -> list[NeedleFit]:
+    """Leave out the fainter of two that have come together: what was split in two is one."""
+    kept: list[NeedleFit] = []
+    for fit in sorted(tees, key=lambda t: -abs(t.depth)):
+        if is_apart(fit, kept, APART_PX[0] / 2):
+            kept.append(fit)
+    return [t for t in tees if any(t is k for k in kept)]
 
 
 def _undisturbed(
