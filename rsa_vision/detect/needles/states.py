@@ -31,6 +31,7 @@ from rsa_vision.detect.needles.irregular import ARMS, WAYS, Regularity, moved_ar
 from rsa_vision.types import Float
 
 LEAST_TAPER = 0.1
+_SOME = 2  # needles: of forty that are alike one is an outlier by chance, and alone tells nothing
 _SEVERAL = 0.05  # spread of the logarithms of lengths; slants of up to 25 degrees make 0.03
 _BOUNDS = (-3.0, 3.0), (-0.8, 1.5), (-0.6, 0.6)  # of the curve, whose skewness is largest where it is a logarithm, and of the tail
 _MOST_LATE, _MOST_LOGGED = 0.6, 3.0
@@ -154,12 +155,12 @@ def sizes_of(systems: list[Equations]) -> Sizes:
 
 def of_several_sizes(sizes: Sizes) -> bool:
     """Say whether some needles differ in size: rays go a longer way through those at a slant, others may be of another metal."""
-    return bool((np.concatenate(sizes.spread) > _SEVERAL).any())
+    return bool((np.concatenate(sizes.spread) > _SEVERAL).any(axis=1).sum() >= _SOME)
 
 
 def of_several_lengths(sizes: Sizes) -> bool:
     """Say whether some needles differ in length by more than a slant makes, which leaves their tapers as they are."""
-    return bool((np.concatenate(sizes.spread)[:, 1] > _SEVERAL).any())
+    return bool((np.concatenate(sizes.spread)[:, 1] > _SEVERAL).sum() >= _SOME)
 
 
 def of_usual_size(sets: list[list[NeedleFit]]) -> list[list[NeedleFit]]:
