@@ -13,6 +13,7 @@ error, so that their ratio can be below 1, and only detections beyond one for ea
 
 Of the pig's beads, labelled by hand in half pixels, *SD about the epipolar geometry* is that of one coordinate in all frames, with one
 fundamental matrix for them: no label enters ours, and what it comes to over what we state should be one.
+From labels that scatter by *s* in each coordinate a detector without any error is 1.18 *s* away in the median.
 """
 
 from __future__ import annotations
