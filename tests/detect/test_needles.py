@@ -1,7 +1,7 @@
 """The image of a needle: as exact chords make it, thick ends seen at a slant included."""
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +9,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
 from rsa_vision.detect.models.film_curve import by_film_curve, film_curve, skewness_of_log, slope_of_film_curve
-from rsa_vision.detect.models.needles import NeedleFit, NeedleShape, arm_images, arms_by_optics
+from rsa_vision.detect.models.needles import NeedleShape, arm_images, arms_by_optics
 from rsa_vision.detect.models.profiles import Optics
+from rsa_vision.detect.needles.fits import unfit
+from rsa_vision.detect.needles.states import Sizes, of_several_lengths, of_several_sizes
 from rsa_vision.types import Float
 from synthetic.chords import chord_pin
 
@@ -98,10 +100,7 @@ def test_images_go_on_where_another_table_begins(step: float) -> None:
         if step == 0.1:
             optics = Optics(SIGMA, MU, uneven=(by, 0.0))
         else:
-            fit = NeedleFit(
-                **dict.fromkeys([f.name for f in fields(NeedleFit)], 0.0) | {"blurrier": by, "denser": -by}  # type: ignore[arg-type]
-            )
-            optics = fit.seen_by(Optics(SIGMA, MU))
+            optics = replace(unfit(np.zeros(2), np.zeros(1), SHAPE), blurrier=by, denser=-by).seen_by(Optics(SIGMA, MU))
         return arm_images(cols, rows, np.array([0.0]), SHAPE, optics)[0, 0]
 
     below, above, beyond = image(0.499 * step), image(0.501 * step), image(1.499 * step)
@@ -182,3 +181,13 @@ def test_derivatives_of_the_film_curve() -> None:
     for slope, by in zip(slopes, (np.array([step, 0]), np.array([0, step])), strict=True):
         high, low = (film_curve(opacity, tuple(np.array([-0.8, 0.2]) + sign * by)) for sign in (1, -1))
         np.testing.assert_allclose(slope, (high - low) / (2 * step), atol=1e-8)
+
+
+@pytest.mark.parametrize(("odd", "several"), [(0, False), (1, False), (2, True)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_one_needle_of_an_odd_size_does_not_make_several_sizes(odd: int, several: bool, axis: int) -> None:
+    spread = np.full((40, 2), 0.02)
+    spread[:odd, axis] = np.inf  # outliers
+    sizes = Sizes(np.zeros(2), [spread[:13], spread[13:]])
+    assert of_several_sizes(sizes) == several
+    assert of_several_lengths(sizes) == (several and axis == 1)

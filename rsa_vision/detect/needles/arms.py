@@ -34,8 +34,8 @@ def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
     """
     pin = np.array([len(f.angles) == 1 for f in needles], bool)
     tip, half = np.array([f.position_px for f in needles]).reshape(-1, 2), np.array([f.shape.half_width_px for f in needles])
-    together = pin & pin[:, None] & (gaps(tip, tip) < half + half[:, None])
-    out = np.asarray(together.sum(axis=1) > 1) | (pin & _face_others(needles))  # a pin is at its own place
+    together = pin & pin[:, None] & ((gaps(tip, tip) < half + half[:, None]) | _face_each_other(needles))
+    out = np.asarray(together.sum(axis=1) > 1)  # a pin is at its own place
     tees = [f for f, single in zip(needles, pin, strict=True) if not single]
     place = np.array([t.position_px for t in tees]).reshape(-1, 2)
     few = 0 < np.count_nonzero(pin) * _FEW_PINS <= len(tees)
@@ -49,15 +49,13 @@ def perhaps_arms(needles: list[NeedleFit], junctions: Float) -> Bool:
     return out
 
 
-def _face_others(needles: list[NeedleFit]) -> Bool:
-    """Say which have in front of their tips that of another that points at theirs."""
+def _face_each_other(needles: list[NeedleFit]) -> Bool:
+    """Say which have the tips of which before their own, and point at them, shape (n, n)."""
     tip, way = np.array([[f.position_px, f.way] for f in needles]).reshape(-1, 2, 2).transpose(1, 0, 2)
-    length = np.array([f.shape.length_px for f in needles])
-    gap = tip - tip[:, None]
+    length, gap = np.array([f.shape.length_px for f in needles]), tip - tip[:, None]
     apart = np.hypot(*gap.transpose(2, 0, 1))
     ahead = -(way[:, None] * gap).sum(axis=2) > math.cos(_PARALLEL) * apart
-    near = (apart > 0) & (apart < _GAP * np.minimum(length, length[:, None]))
-    return np.asarray((near & ahead & ahead.T).any(axis=1))
+    return np.asarray(ahead & ahead.T & (apart < _GAP * np.minimum(length, length[:, None])))
 
 
 def meet_others(film: NDArray[Any], needles: list[NeedleFit]) -> Bool:

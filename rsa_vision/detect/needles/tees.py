@@ -152,7 +152,7 @@ def _one_each(tees: list[NeedleFit]) -> list[NeedleFit]:
     for fit in sorted(tees, key=lambda t: -abs(t.depth)):
         if is_apart(fit, kept, APART_PX[0] / 2):
             kept.append(fit)
-    return [t for t in tees if any(t is k for k in kept)]
+    return kept
 
 
 def _undisturbed(
